@@ -131,6 +131,7 @@ class Run(RunFolder):
         name: str | None = None,
         seed: int | None = None,
         certify: bool = False,
+        survive: int | None = None,
         workers: int | str = 1,
         notes: Notes = log_note,
         progress: Progress | None = None,
@@ -152,6 +153,7 @@ class Run(RunFolder):
             name: The design's name.
             seed: Seed of all random numbers; the run's by default.
             certify: Whether every number of rays gets a certificate, not the middle one alone.
+            survive: 1: rays are chosen for the loss of any one sensor, too; by default as constraints say.
             workers: Processes that look at training scenes, or the address of a dask scheduler, tcp://HOST:PORT.
             notes: Called with every note; they are logged by default.
             progress: Called with every step, as "choosing 361 rays", and twice None.
@@ -176,6 +178,7 @@ class Run(RunFolder):
             name=name,
             seed=seed,
             certify=certify,
+            survive=survive,
         )
         request = FitRequest.resolve(self, options, notes=notes)
         return Design.fitted(request, workers=workers, notes=notes, progress=progress)

@@ -8,7 +8,6 @@ condition, as a robot's position, rays are chosen at each of its values that des
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -17,9 +16,8 @@ import numpy as np
 
 from lidardesign.constraints.document import Constraints, SensorRules, rules_of
 from lidardesign.errors import check_number
-from lidardesign.mixture.bounds import INWARD, bounds_of
+from lidardesign.fitting.fields import smallest_field, widened
 from lidardesign.mixture.fit import FittedSensors
-from lidardesign.numerics import COARSE_SLACK
 from lidardesign.rays.gates import GateLimits
 from lidardesign.rays.information import FEW_SCENES, MOST_SELECTED
 from lidardesign.rays.pool import CandidatePool, cached_information
@@ -31,24 +29,9 @@ from lidardesign.samples import Samples
 from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.bandwidth import Bandwidth, split_budget
 from lidardesign.sensors.pattern import Pattern
-from lidardesign.sensors.sensor import Sensor, interval_factor, tangent_directions
-from lidardesign.space import (
-    AZIMUTH,
-    DIMENSIONS,
-    ELEVATION,
-    RANGE,
-    DesignSpace,
-    aim,
-    angles,
-    direction,
-    observed_point,
-)
+from lidardesign.sensors.sensor import Sensor
+from lidardesign.space import DIMENSIONS, direction
 from lidardesign.task import random_generator
-
-# Rounds in which a boresight moves to the middle of its rays: away from the poles it rests after two or three.
-CENTRING_ROUNDS = 8
-# Fields hold their outermost rays, whatever digits of angles a file rounds.
-FIELD_SLACK = COARSE_SLACK / 10
 
 
 class ChosenRays(NamedTuple):
@@ -60,6 +43,7 @@ class ChosenRays(NamedTuple):
         certificates: Of the numbers of rays that were certified.
         idle: Indices of sensors that fire no ray at the largest number.
         silent: The share of scenes held back about which the largest number of rays has no information.
+        shared: The share of what sensors see that several of them see; 1 where none may fail.
     """
 
     sensors: tuple[Sensor, ...]
@@ -67,6 +51,7 @@ class ChosenRays(NamedTuple):
     certificates: tuple[dict[str, object], ...]
     idle: tuple[int, ...]
     silent: float
+    shared: float = 1.0
 
 
 def choose_rays(
@@ -107,10 +92,10 @@ def choose_rays(
     """
     check_number(counts[-1], "--rays", 1, MOST_SELECTED)
     budget, conditions = constraints.budget, training.run.conditions(samples.space)
-    placed = fitted.sensors
-    if constraints.survive:
+    placed, may_fail = fitted.sensors, bool(constraints.survive)
+    if may_fail:
         placed = widened(placed, constraints.rules, level, samples)
-    proposals = Proposals(placed, constraints.rules, level, samples, by_turns=bool(constraints.survive))
+    proposals = Proposals(placed, constraints.rules, level, samples, by_turns=may_fail)
     wanted, weights = CANDIDATES_PER_RAY * counts[-1], np.array([sensor.weight for sensor in placed])
     least = np.full(len(weights), CANDIDATES_PER_RAY if each_fires else 0)
     if len(conditions) > 1:
@@ -119,9 +104,7 @@ def choose_rays(
     picked = None if pool is None else _picked(pool, proposals, conditions, wanted, least)
     lists = picked[0] if picked else _drawn(proposals, conditions, wanted, least, training.seed)
     ends = np.cumsum([0, *map(len, lists)]).tolist()
-    limits = GateLimits(
-        placed, constraints.rules, level, samples.space, training.margin_m, is_shared=gates != "ray"
-    )
+    limits = GateLimits(placed, constraints.rules, level, samples.space, training.margin_m, is_shared=gates != "ray")
     selection = Selection(
         rays=Rays.joined(lists),
         visits=[slice(*pair) for pair in itertools.pairwise(ends)],
@@ -131,7 +114,7 @@ def choose_rays(
         shares=weights if len(lists) > 1 else None,
         is_shared=gates != "ray",
         each_fires=each_fires,
-        may_fail=bool(constraints.survive),
+        may_fail=may_fail,
     )
     if picked:
         informed, held_back = picked[1:]
@@ -156,6 +139,7 @@ def choose_rays(
         tuple(one.certificate for one in selected if one.certificate is not None),
         tuple(np.flatnonzero(per_sensor == 0).tolist()),
         selected[-1].silent,
+        proposals.share_of_several(conditions[len(conditions) // 2]) if may_fail else 1.0,
     )
 
 
@@ -213,61 +197,4 @@ def _around_rays(
     return replace(
         smallest_field(sensor, looking, rules, samples.space),
         gate_m=(float(gate_m[:, 0].min()), float(gate_m[:, 1].max())),
-    )
-
-
-def smallest_field(sensor: Sensor, looking: np.ndarray, rules: SensorRules, space: DesignSpace) -> Sensor:
-    """The sensor, turned where it may turn, with the smallest field inside its own that holds directions (N, 3).
-
-    It is unchanged where no field inside its own holds them.
-    """
-    widest, fields, bounds = np.array(sensor.field_of_view_rad), rules.field_of_view, rules.boresight
-    least = np.radians([fields.horizontal_deg.min or 0.0, fields.vertical_deg.min or 0.0])
-    ends = (bounds.azimuth_deg.min, bounds.azimuth_deg.max, bounds.elevation_deg.min, bounds.elevation_deg.max)
-    may_turn = all(end is None for end in ends) and {AZIMUTH, ELEVATION} <= set(space.free)
-    tried, best, smallest = sensor, sensor, math.inf
-    for _ in range(CENTRING_ROUNDS if may_turn else 1):
-        tangent = tried.tangent_of(looking)
-        view = np.maximum(2 * np.abs(tangent).max(axis=0) * (1 + FIELD_SLACK) + FIELD_SLACK, least)
-        view = np.minimum(np.where(widest > 0, view, 0.0), widest + FIELD_SLACK)
-        area = float(view[view > 0].prod())
-        if (2 * np.abs(tangent).max(axis=0) <= np.minimum(view, widest) + FIELD_SLACK).all() and area < smallest:
-            best, smallest = replace(tried, field_of_view_rad=tuple(np.minimum(view, widest).tolist())), area
-        middle = (tangent.min(axis=0) + tangent.max(axis=0)) / 2
-        azimuth, elevation = (float(angle) for angle in angles(tangent_directions(tried.frame, middle[None])[0]))
-        tried = replace(tried, azimuth_rad=azimuth, elevation_rad=elevation)
-    return best
-
-
-def widened(
-    sensors: Sequence[Sensor], rules: Sequence[SensorRules], level: float, samples: Samples
-) -> tuple[Sensor, ...]:
-    """Sensors of equal shares that see as much of the density as constraints allow, so that each can replace others."""
-    return tuple(
-        replace(_widened(sensor, index, rules, level, samples), weight=1 / len(sensors))
-        for index, sensor in enumerate(sensors)
-    )
-
-
-def _widened(sensor: Sensor, index: int, rules: Sequence[SensorRules], level: float, samples: Samples) -> Sensor:
-    space, own = samples.space, rules_of(rules, index)
-    origins = samples.points[:, :3].copy()
-    if sensor.origin_covariance_m2 is None:
-        placed = [axis for axis in range(3) if axis not in space.conditioned]
-        origins[:, placed] = np.asarray(sensor.origin_m)[placed]
-    points = space.wrap(aim(origins, observed_point(samples.points)))
-    looking = direction(points[:, AZIMUTH], points[:, ELEVATION])
-    ends = (1 - level) / 2, (1 + level) / 2
-    values = np.column_stack([sensor.tangent_of(looking), points[:, RANGE]])
-    low, high = np.quantile(values, ends, axis=0, weights=samples.weights, method="inverted_cdf")
-    inside = ((low <= values) & (values <= high)).all(axis=1)
-    bounds = bounds_of(rules, space, (index,), interval_factor(level))
-    start = max(min(float(low[2]), sensor.gate_m[0]), float(bounds.start_low[0]))
-    end = min(max(float(high[2]), sensor.gate_m[1]), float(bounds.end_high[0]))
-    gate_m = (start, end) if end - start <= bounds.width_high[0] else sensor.gate_m
-    most_deg = (own.field_of_view.horizontal_deg.max, own.field_of_view.vertical_deg.max)
-    most = [2 * math.pi if one is None else (1 - INWARD) * math.radians(one) for one in most_deg]
-    view = tuple(limit if field > 0 else 0.0 for field, limit in zip(sensor.field_of_view_rad, most, strict=True))
-    return smallest_field(
-        replace(sensor, field_of_view_rad=view, gate_m=gate_m), looking[inside], own, space
     )

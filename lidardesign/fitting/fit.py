@@ -52,6 +52,8 @@ if TYPE_CHECKING:
 
 # A larger share of scenes without information from a design is noted.
 MOST_SILENT = 0.5
+# So much of what sensors see is seen by several, or a note says so where a sensor may fail.
+LEAST_SHARED = 0.9
 # As many samples as the standard preset of `learn` leaves.
 TWIN_SAMPLES = 100_000
 TWIN_NAME = "no-visibility"
@@ -213,8 +215,7 @@ class Fitter:
 
     def _without_idle(self, count: int) -> FitResult:
         """The design of at most `count` sensors, fewer while any would fire no ray or rest on too few samples."""
-        bounds = self.request.constraints
-        least = max(bounds.sensors.min or 1, len(bounds.each))
+        least = self.request.constraints.least_sensors
         while count > least:
             try:
                 result = self._fitted(replace(self.request, sensors=count), may_idle=True)
@@ -295,6 +296,11 @@ class Fitter:
                     f"about {chosen.silent:.0%} of the training scenes that were held back, no ray tells anything; "
                     "where that is not expected, check that places, directions and gates are right, and in metres"
                 )
+            if chosen.shared < LEAST_SHARED:
+                notes.append(
+                    f"constraints let several sensors see {chosen.shared:.0%} of what they see together: the rest is "
+                    "lost with its sensor; allow wider fields of view or gates"
+                )
         elif fitted.rays is not None:
             design = replace(design, constraints=merged(design.constraints, {"budget": {"rays": fitted.rays}}))
         result = FitResult.of_fit(design, fitted, self.samples, time.perf_counter() - started)
@@ -373,14 +379,14 @@ def trials_of(request: FitRequest, scenes: Sequence[Scene], fit: Callable[[FitRe
     Raises:
         InfeasibleError: No number of sensors keeps the constraints; the message is that of the fewest.
     """
-    from lidardesign.scoring.scene_scores import score_lists
+    from lidardesign.scoring.scene_scores import score_lists, without_each
     from lidardesign.simulate.returns import build_casters
 
     run, bounds = request.run, request.constraints
     rays = request.counts[len(request.counts) // 2]
     conditions = [{**request.at, **one} for one in run.conditions(run.config.space.at(request.at))]
     casters = [build_casters(scene) for scene in scenes]
-    low = max(bounds.sensors.min or 1, len(bounds.each))
+    low = bounds.least_sensors
     high = bounds.sensors.max or math.inf
     trials: list[Trial] = []
     refused = None
@@ -391,11 +397,14 @@ def trials_of(request: FitRequest, scenes: Sequence[Scene], fit: Callable[[FitRe
             refused = refused or error
             continue
         fired = tuple(design.rays(rays, at=at or None) for at in conditions)
+        # as rays are chosen: all sensors count as much as the mean over the loss of each
+        lists = [fired, *(without_each(fired, len(design.sensors)) if bounds.survive else [])]
         scores = [
-            next(score_lists(run.task, run.metric, scene, [fired], caster))[0].value
+            [score.value for score, _ in score_lists(run.task, run.metric, scene, lists, caster)]
             for scene, caster in zip(scenes, casters, strict=True)
         ]
-        trials.append(Trial(count, np.array(scores), mean_mbps(fired, Bandwidth())))
+        means = np.array([(one[0] + np.mean(one[1:] or one)) / 2 for one in scores])
+        trials.append(Trial(count, means, mean_mbps(fired, Bandwidth())))
     if not trials and refused is not None:
         raise refused
     return trials
@@ -462,6 +471,8 @@ def twin_without_visibility(
     seed = seed if isinstance(seed, int) else 0
     drawn = twin_samples(run) if samples is None else samples()
     document = {key: value for key, value in design.constraints.items() if key != "parts"}
+    if rays == 1:
+        document.pop("survive", None)
     # a bandwidth is one of evaluations, whatever bits the design was made for
     budget = document.get("budget", {}) if bandwidth_mbps is None else {"bandwidth_mbps": bandwidth_mbps}
     document["budget"] = {**budget, "rays": rays}

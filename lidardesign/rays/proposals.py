@@ -81,9 +81,20 @@ class Proposals:
             rays = Rays.joined([rays, even_rays(sensors, even)])
         return replace(rays, time_s=np.zeros(len(rays)))
 
-    def owners(self, sensors: Sequence[Sensor], points: np.ndarray, space: DesignSpace) -> tuple[np.ndarray, np.ndarray]:
+    def owners(
+        self, sensors: Sequence[Sensor], points: np.ndarray, space: DesignSpace
+    ) -> tuple[np.ndarray, np.ndarray]:
         """As the function `owners`, of sensors as they stand at a value of the condition."""
         return owners(sensors, self.rules, self.level, points, space, by_turns=self.by_turns)
+
+    def share_of_several(self, at: Mapping[str, float]) -> float:
+        """The share of what the sensors see of the density, at a value of the condition, that several of them see."""
+        samples, sensors = nearest_samples(self.samples, at), self.sensors_at(at)
+        seen = np.zeros(len(samples), dtype=np.intp)
+        for index, sensor in enumerate(sensors):
+            own = [rules_of(self.rules, index)]
+            seen += owners([sensor], own, self.level, samples.points, samples.space)[0] >= 0
+        return float(samples.weights[seen > 1].sum()) / max(float(samples.weights[seen > 0].sum()), TINY)
 
     def sensors_at(self, at: Mapping[str, float]) -> list[Sensor]:
         """The sensors as they stand at a value of the condition."""

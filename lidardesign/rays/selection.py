@@ -43,7 +43,7 @@ class Selection:
         shares: The share of the rays that each sensor fires, (S,); None leaves it to the choice.
         is_shared: Whether all rays of a sensor have one gate.
         each_fires: Whether every sensor has to fire a ray.
-        may_fail: Whether the mean over the loss of each sensor counts, instead of what all of them see together.
+        may_fail: Whether the mean over the loss of each sensor counts as much as what all of them see together.
         share: The share of the candidates that is chosen, at the largest number of rays.
         name: Of the design, for messages.
     """
