@@ -26,7 +26,7 @@ from lidardesign.constraints.document import Constraints, merged
 from lidardesign.constraints.feasibility import check_feasible
 from lidardesign.constraints.origins import placement_notes
 from lidardesign.errors import BackgroundNote, DataError, InfeasibleError
-from lidardesign.fitting.request import BEST, COUNTS, KEY, FitRequest, FitResult, RunTarget, Weighting
+from lidardesign.fitting.request import BEST, COUNTS, KEY, FitRequest, FitResult, RunTarget, Weighting, check_several
 from lidardesign.formats.designs import relative_folder
 from lidardesign.mixture.fit import FitProblem, FittedSensors, fit_sensors
 from lidardesign.mixture.support import LEAST_SAMPLES, MOVED_SAMPLES, Retarget, at_condition, condition_text
@@ -263,6 +263,8 @@ class Fitter:
         started, constraints, counts = time.perf_counter(), request.constraints, request.counts
         is_chosen = request.layout == "chosen"
         fitted = self._sensors(request, constraints, counts[-1] if is_chosen else request.rays)
+        if constraints.survive:
+            check_several(len(fitted.sensors))
         design = DesignSpec(
             name=request.name,
             sensors=fitted.sensors,

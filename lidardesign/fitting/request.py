@@ -22,7 +22,6 @@ from lidardesign.constraints.document import MOST_FITTED, Constraints
 from lidardesign.constraints.origins import is_mounted, origin_box, snap_to_space
 from lidardesign.errors import MAX_SEED, ConfigError, InfeasibleError, check_choice, check_number
 from lidardesign.estimates import Estimate, as_documents
-from lidardesign.fitting.fields import check_several
 from lidardesign.formats.designs import reach_of, read_design
 from lidardesign.formats.rig import moved_notes, rig_constraints, rig_notes
 from lidardesign.mixture.fit import FittedSensors
@@ -383,6 +382,18 @@ def _with_survival(options: FitOptions, asked: Constraints | None) -> Constraint
         return asked
     document = {} if asked is None else asked.as_document()
     return Constraints.from_mapping({**document, "survive": options.survive})
+
+
+def check_several(sensors: float) -> None:
+    """Refuse a single sensor that may fail.
+
+    Raises:
+        ConfigError: Fewer than two sensors.
+    """
+    if sensors < 2:
+        raise ConfigError(
+            "a single sensor that may fail", where="survive", allowed="2 sensors or more", hint="--sensors 2"
+        )
 
 
 def _sensors(
