@@ -71,8 +71,9 @@ class FirstHits:
         rays = Rays(*(np.concatenate([getattr(one, name) for one in lists]) for name in names))
         sizes = np.array([len(one) for one in lists])
         row = np.repeat(np.arange(len(lists)), sizes)
+        sharing = np.concatenate([detector.sharing(one.sensor) for one in lists])
         hits = caster.first_hit(rays.origin_m, rays.direction)
-        return cls(scene, frame, detector, rays, row, sizes[row], hits, caster)
+        return cls(scene, frame, detector, rays, row, sharing, hits, caster)
 
     def __len__(self) -> int:
         return len(self.rays)
