@@ -190,12 +190,13 @@ class ArrivingLight:
             ConfigError: A window has too many bins.
         """
         count, photons = len(windows_m), physics.detector.photons
-        sharing = physics.detector.sharing(rays.sensor)
+        sharing = physics.detector.sharing(rays)
         bins = bins_of(windows_m, echoes, physics.detector, "quantisation" in physics.effects)
         order = np.argsort(echoes.ray, kind="stable")
         offset = np.concatenate([[0], np.cumsum(np.bincount(echoes.ray, minlength=count))])
         pulses = photons.pulses(sharing)
-        per_gain = (pulses * photons.emitted(sharing) * photons.aperture_m2 * photons.efficiency)[echoes.ray[order]]
+        per_pulse = photons.emitted(sharing) * physics.detector.light_of(rays)
+        per_gain = (pulses * per_pulse * photons.aperture_m2 * photons.efficiency)[echoes.ray[order]]
         # limited before the product: a surface that touches the receiver has the largest gain there is
         expected = np.minimum(echoes.gain[order], MOST_COUNTS / per_gain) * per_gain
         return cls(

@@ -20,6 +20,7 @@ import numpy as np
 from lidardesign.errors import ConfigError
 from lidardesign.numerics import SLACK
 from lidardesign.run.validation import suggest
+from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import SPEED_OF_LIGHT_M_S, Scene
 from lidardesign.simulate.detector.light import Echoes
 
@@ -110,12 +111,16 @@ class Detector:
     correction: Literal["none", "coates"] = "none"
     emitters: Literal["sensor", "shared"] = "sensor"
 
-    def sharing(self, sensor: np.ndarray) -> np.ndarray:
-        """Number of rays that share each ray's emitter, given its sensor, shape (N,) for (N,)."""
+    def sharing(self, rays: Rays) -> np.ndarray:
+        """Number of rays that share each ray's emitter, shape (N,)."""
         if self.emitters == "shared":
-            return np.full(len(sensor), len(sensor))
-        _, place, rays = np.unique(sensor, return_inverse=True, return_counts=True)
-        return rays[place]
+            return np.full(len(rays), len(rays))
+        _, place, count = np.unique(rays.sensor, return_inverse=True, return_counts=True)
+        return count[place]
+
+    def light_of(self, rays: Rays) -> np.ndarray | float:
+        """Light of each ray's emitter as a multiple of `photons`, shape (N,) or one for all."""
+        return 1.0 if self.emitters == "shared" or rays.light is None else rays.light
 
     @property
     def timing_sigma_s(self) -> float:

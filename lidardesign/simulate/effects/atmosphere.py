@@ -76,7 +76,8 @@ def through_air(
     np.maximum.at(ends, beams.ray, stops_m)
     edges_m = _cells(windows_m[:, 0], np.clip(ends, windows_m[:, 0], windows_m[:, 1]), photons.aperture_m2)
     gain = _Haze(rays, scene.receiver, medium, photons, ends).gain(edges_m) * _lit_shares(beams, stops_m, edges_m)
-    counts = photons.emitted(detector.sharing(rays.sensor))[:, None] * photons.efficiency * gain
+    emitted = photons.emitted(detector.sharing(rays)) * detector.light_of(rays)
+    counts = emitted[:, None] * photons.efficiency * gain
     return faded, replace(background, edges_m=edges_m, counts=counts)
 
 

@@ -142,6 +142,12 @@ class Counts:
         return self.first_hits.detector.photons.pulses(self.first_hits.sharing)
 
     @cached_property
+    def _emitted(self) -> np.ndarray:
+        """Emitted photons of each ray per pulse, shape (N,)."""
+        detector = self.first_hits.detector
+        return detector.photons.emitted(self.first_hits.sharing) * detector.light_of(self.first_hits.rays)
+
+    @cached_property
     def signal_per_pulse(self) -> np.ndarray:
         """Counts of a return per pulse in clear air, 0 without one, shape (N,)."""
         return np.where(self.first_hits.returned, self._of_first_hit, 0.0)
@@ -149,7 +155,7 @@ class Counts:
     @cached_property
     def _of_first_hit(self) -> np.ndarray:
         photons = self.first_hits.detector.photons
-        per_gain = photons.emitted(self.first_hits.sharing) * photons.aperture_m2 * photons.efficiency
+        per_gain = self._emitted * photons.aperture_m2 * photons.efficiency
         # limited before the product: a surface that touches the receiver has the largest gain there is
         return np.minimum(self.first_hits.gain, MOST_COUNTS / (per_gain * self.pulses)) * per_gain
 
@@ -198,8 +204,7 @@ class Counts:
     @cached_property
     def haze_per_pulse(self) -> tuple[np.ndarray, np.ndarray]:
         """Upper bounds of backscattered counts per pulse, in the window up to the return and in one bin, (N,)."""
-        emitted = self.first_hits.detector.photons.emitted(self.first_hits.sharing)
-        return haze_per_pulse(self.first_hits, emitted, self.bin_m)
+        return haze_per_pulse(self.first_hits, self._emitted, self.bin_m)
 
     @cached_property
     def bin_m(self) -> float:
