@@ -11,14 +11,11 @@ A design's twin is fitted to the density without its occlusion term, without lea
 from __future__ import annotations
 
 import itertools
-import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, NamedTuple
-
-import numpy as np
+from typing import TYPE_CHECKING
 
 from lidardesign.config import with_task_settings
 from lidardesign.constraints.check import ConstraintCheck, check_design
@@ -27,24 +24,22 @@ from lidardesign.constraints.feasibility import check_feasible
 from lidardesign.constraints.origins import placement_notes
 from lidardesign.errors import BackgroundNote, DataError, InfeasibleError
 from lidardesign.fitting.request import BEST, COUNTS, KEY, FitRequest, FitResult, RunTarget, Weighting
+from lidardesign.fitting.trials import HeldBackScenes, best_of, trials_of
 from lidardesign.formats.designs import relative_folder
 from lidardesign.mixture.fit import FitProblem, FittedSensors, fit_sensors
 from lidardesign.mixture.support import LEAST_SAMPLES, MOVED_SAMPLES, Retarget, at_condition, condition_text
 from lidardesign.rays.information import checked_information
 from lidardesign.rays.proposals import nearest_samples
-from lidardesign.rays.selection import SHARE_PER_BANDWIDTH
-from lidardesign.rays.training import CHOICE, HELD_BACK, TrainingScenes
+from lidardesign.rays.training import CHOICE, TrainingScenes
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.run.manifest import versions
 from lidardesign.run.yaml import dump_yaml, parse_yaml
 from lidardesign.run_folder import Notes, RunFolder, ignore, log_note
 from lidardesign.samples import Samples, load_samples
-from lidardesign.scenes.scene import Scene, group_numbers
-from lidardesign.sensors.bandwidth import Bandwidth, mean_mbps
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import design_document
-from lidardesign.task import Metric, mount_of, random_generator
+from lidardesign.task import mount_of, random_generator
 from lidardesign.workers import Starmap
 
 if TYPE_CHECKING:
@@ -304,7 +299,6 @@ class Fitter:
         """The number of sensors that scores best on training scenes, with a note on those tried."""
         request, metric = self.request, self.request.run.metric
         check_feasible(request.constraints, request.run.config.space, rays=request.rays)
-        scenes = self.training.first(HELD_BACK)
         if not self.is_pooled:
             # all trials cast their candidates into the same scenes
             self.training.first(CHOICE)
@@ -313,10 +307,12 @@ class Fitter:
             self.progress(f"trying --sensors {trial.sensors}")
             return self._fitted(trial, is_trial=True, may_idle=True).design
 
-        trials = trials_of(request, scenes, fit)
-        best = best_of(trials, scenes, metric)
+        scenes = HeldBackScenes(self.training)
+        with phase("trials"):
+            trials = trials_of(request, fit, COUNTS)
+            best = best_of(trials, scenes, metric)
         found = ", ".join(f"{one.sensors}: {one.scores.mean():.4g} in {one.mbps:.3g} Mbit/s" for one in trials)
-        text = f"sensors: {best.sensors}; {metric.name} [{metric.unit}] on {len(scenes)} training scenes "
+        text = f"sensors: {best.sensors}; {metric.name} [{metric.unit}] on {len(best.scores)} training scenes "
         self.notes(BackgroundNote(f"{text}by their number: {found}"))
         return best.sensors
 
@@ -351,70 +347,6 @@ class Fitter:
             scenes=self.training.scenes,
             name=request.name,
         )
-
-
-class Trial(NamedTuple):
-    """A design of some number of sensors, its score on each scene, and its bandwidth."""
-
-    sensors: int
-    scores: np.ndarray
-    mbps: float
-
-
-@phase("trials")
-def trials_of(request: FitRequest, scenes: Sequence[Scene], fit: Callable[[FitRequest], DesignSpec]) -> list[Trial]:
-    """Designs of several numbers of sensors, ascending.
-
-    Arguments:
-        request: What is asked for, but for the number of sensors.
-        scenes: Training scenes that designs are not fitted to.
-        fit: Fits the design of a request.
-
-    Raises:
-        InfeasibleError: No number of sensors keeps the constraints; the message is that of the fewest.
-    """
-    from lidardesign.scoring.scene_scores import score_lists
-    from lidardesign.simulate.returns import build_casters
-
-    run, bounds = request.run, request.constraints
-    rays = request.counts[len(request.counts) // 2]
-    conditions = [{**request.at, **one} for one in run.conditions(run.config.space.at(request.at))]
-    casters = [build_casters(scene) for scene in scenes]
-    low = max(bounds.sensors.min or 1, len(bounds.each))
-    high = bounds.sensors.max or math.inf
-    trials: list[Trial] = []
-    refused = None
-    for count in [count for count in COUNTS if low <= count <= high] or [low]:
-        try:
-            design = fit(replace(request, sensors=count, rays=rays))
-        except InfeasibleError as error:
-            refused = refused or error
-            continue
-        fired = tuple(design.rays(rays, at=at or None) for at in conditions)
-        scores = [
-            next(score_lists(run.task, run.metric, scene, [fired], caster))[0].value
-            for scene, caster in zip(scenes, casters, strict=True)
-        ]
-        trials.append(Trial(count, np.array(scores), mean_mbps(fired, Bandwidth())))
-    if not trials and refused is not None:
-        raise refused
-    return trials
-
-
-def best_of(trials: Sequence[Trial], scenes: Sequence[Scene], metric: Metric) -> Trial:
-    """The fewest sensors that are no worse than the best by more than the standard error of the difference.
-
-    Bandwidth costs what it does in a choice of rays: ten percent more of it must bring two percent of the best score,
-    or of its distance from the worst value, whichever is less.
-    """
-    sign, groups = 1.0 if metric.better == "lower" else -1.0, group_numbers(scenes)
-    score = sign * min(sign * trial.scores.mean() for trial in trials)
-    price = SHARE_PER_BANDWIDTH * min(abs(score), abs(metric.worst - score))
-    costs = [sign * trial.scores + price * math.log(trial.mbps) for trial in trials]
-    least = min(costs, key=np.mean)
-    lost = [np.bincount(groups, cost - least) / np.bincount(groups) for cost in costs]
-    errors = [one.std(ddof=1) / math.sqrt(len(one)) if len(one) > 1 else 0.0 for one in lost]
-    return next(trial for trial, one, error in zip(trials, lost, errors, strict=True) if one.mean() <= error)
 
 
 def twin_samples(run: RunFolder) -> Samples:

@@ -25,7 +25,7 @@ from lidardesign.space import DesignSpace
 from lidardesign.task import Defaults, Information, Interval, Metres, Metric, Score, Split, Vector, random_generator
 from lidardesign_tasks.basel import MorphableModel, Unit, load_model
 from lidardesign_tasks.importance import WEIGHING_KEYS, Importance, middle_of_origins
-from lidardesign_tasks.pose import jittered_pose
+from lidardesign_tasks.poses import jittered_pose
 from lidardesign_tasks.surface import surface_informs, surface_score, with_visible_truth
 from lidardesign_tasks.surroundings import any_direction
 

@@ -30,7 +30,7 @@ from lidardesign_tasks.importance import WEIGHING_KEYS, Importance, middle_of_or
 from lidardesign_tasks.motion import Motion, load_motion, moved_bounds_m
 from lidardesign_tasks.moving_surface import SURFACES, moving_informs, moving_score, with_moving_truth
 from lidardesign_tasks.piles import Background, Kind, background_of, settled_poses
-from lidardesign_tasks.pose import jittered_pose
+from lidardesign_tasks.poses import jittered_pose
 from lidardesign_tasks.surface import (
     METRIC,
     MILLIMETRES,

@@ -11,7 +11,7 @@ import numpy as np
 
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.scenes.scene import Mesh
-from lidardesign_tasks.poses_csv import BodyPath, read_poses, span_s
+from lidardesign_tasks.poses import BodyPath, read_poses, span_s
 
 EVERY = "*"
 MOST_FRAMES = 500

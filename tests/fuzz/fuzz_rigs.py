@@ -118,7 +118,7 @@ def poses(_: Path) -> list[bytes]:
 
 def read_motion(path: Path) -> object:
     """As the task meshes does with `motion`."""
-    from lidardesign_tasks.poses_csv import read_poses
+    from lidardesign_tasks.poses import read_poses
 
     paths = read_poses(path)
     return {name: (one.time_s, one.at(np.linspace(-1.0, 3.0, 5))) for name, one in paths.items()}

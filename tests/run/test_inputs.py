@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 from lidardesign_tasks.basel import load_model
-from lidardesign_tasks.poses_csv import read_poses
+from lidardesign_tasks.poses import read_poses
 
 from lidardesign.config import load_run_config
 from lidardesign.density.training.checkpoint import load_arrays

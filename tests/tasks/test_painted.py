@@ -17,7 +17,7 @@ from lidardesign_tasks.importance import (
     vertex_roughness,
 )
 from lidardesign_tasks.meshes import MeshesConfig, MeshesTask
-from lidardesign_tasks.pose import rotation_matrix
+from lidardesign_tasks.poses import rotation_matrix
 from pydantic import ValidationError
 
 from lidardesign.errors import ConfigError, DataError

@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 from lidardesign_tasks.meshes import MeshesTask
 from lidardesign_tasks.motion import moved_bounds_m
 from lidardesign_tasks.moving_surface import SURFACES
-from lidardesign_tasks.pose import rotation_matrix
-from lidardesign_tasks.poses_csv import interpolated, read_poses, rotation_vector
+from lidardesign_tasks.poses import interpolated, read_poses, rotation_matrix, rotation_vector
 from lidardesign_tasks.surface import METRIC
 from pydantic import ValidationError
 from support.rays import rays_of_points

@@ -12,7 +12,7 @@ from lidardesign_tasks.emitter import EmitterTask
 from lidardesign_tasks.face import FaceTask
 from lidardesign_tasks.flatland import FlatlandTask
 from lidardesign_tasks.meshes import MeshesTask
-from lidardesign_tasks.pose import jittered_pose
+from lidardesign_tasks.poses import jittered_pose
 from lidardesign_tasks.surface import fewer_points
 from lidardesign_tasks.warehouse import WarehouseTask
 from support.meshes import write_ball

@@ -1,4 +1,4 @@
-"""Poses of bodies over time from a CSV file.
+"""Poses of bodies over time from a CSV file, and small random ones.
 
 One row is the pose of one body at one time, under a header that names the columns: `time_s`, `body`, `x_m`, `y_m`,
 `z_m`, and for rotations either a quaternion `qw`, `qx`, `qy`, `qz` of any length, or `roll_deg`, `pitch_deg`, `yaw_deg`
@@ -23,7 +23,6 @@ from lidardesign.run.yaml import plain_number
 from lidardesign.scenes.rays import rotation_of_quaternion, rotation_of_rpy
 from lidardesign.scenes.scene import rigid
 from lidardesign.space import FARTHEST_M
-from lidardesign_tasks.pose import rotation_matrix
 
 PLACE = ("x_m", "y_m", "z_m")
 QUATERNION = ("qw", "qx", "qy", "qz")
@@ -35,6 +34,7 @@ MOST_ROWS = 200_000
 LATEST_S = 1e9
 LARGEST_NUMBER = FARTHEST_M
 LONGEST_QUOTE = 60
+LARGEST_DEVIATIONS = 2.5  # jitter is normal, clipped at this many standard deviations
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,3 +195,29 @@ def _path(poses: Sequence[tuple[float, np.ndarray, int]], name: str, path: Path)
 def span_s(paths: Mapping[str, BodyPath]) -> tuple[float, float]:
     """First and last time of any body [s]."""
     return min(float(one.time_s[0]) for one in paths.values()), max(float(one.time_s[-1]) for one in paths.values())
+
+
+def rotation_matrix(rotation_rad: np.ndarray) -> np.ndarray:
+    """The 3x3 rotation about a vector by its length [rad] (Rodrigues' formula)."""
+    angle = float(np.linalg.norm(rotation_rad))
+    if angle == 0:
+        return np.eye(3)
+    x, y, z = np.asarray(rotation_rad) / angle
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross)
+
+
+def jittered_pose(
+    generator: np.random.Generator, rotation_deg: float, translation_m: float, centre_m: np.ndarray
+) -> np.ndarray:
+    """A 4x4 pose: a normal random rotation about a centre and a normal random shift, per axis.
+
+    Arguments:
+        generator: The random generator.
+        rotation_deg: Standard deviation of the rotation about each axis [degrees].
+        translation_m: Standard deviation of the shift along each axis [m].
+        centre_m: Centre of the rotation [m], shape (3,).
+    """
+    draws = np.clip(generator.normal(size=(2, 3)), -LARGEST_DEVIATIONS, LARGEST_DEVIATIONS)
+    rotation = rotation_matrix(np.deg2rad(rotation_deg) * draws[0])
+    return rigid(rotation, translation_m * draws[1] + centre_m - rotation @ centre_m)
