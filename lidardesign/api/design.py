@@ -113,6 +113,7 @@ class Design(DesignSource):
         name: str | None = None,
         seed: int | None = None,
         certify: bool = False,
+        survive: int | None = None,
         workers: int | str = 1,
         notes: Notes = log_note,
         progress: Progress | None = None,
@@ -134,6 +135,7 @@ class Design(DesignSource):
             name: The design's name; "constrained" by default.
             seed: Seed of all random numbers; the run's by default.
             certify: Whether every number of rays gets a certificate, not the middle one alone.
+            survive: 1: rays are chosen for the loss of any one sensor, too; by default as constraints say.
             workers: Processes that look at training scenes, or the address of a dask scheduler, tcp://HOST:PORT.
             notes: Called with every note.
             progress: Called with every step, as "choosing 361 rays", and twice None.
@@ -158,6 +160,7 @@ class Design(DesignSource):
             name=name,
             seed=seed,
             certify=certify,
+            survive=survive,
         )
         request = FitRequest.resolve(run, options, self.specification, notes=notes)
         return Design.fitted(request, workers=workers, notes=notes, progress=progress)

@@ -131,6 +131,7 @@ class Run(RunFolder):
         name: str | None = None,
         seed: int | None = None,
         certify: bool = False,
+        survive: int | None = None,
         workers: int | str = 1,
         notes: Notes = log_note,
         progress: Progress | None = None,
@@ -152,6 +153,7 @@ class Run(RunFolder):
             name: The design's name.
             seed: Seed of all random numbers; the run's by default.
             certify: Whether every number of rays gets a certificate, not the middle one alone.
+            survive: 1: rays are chosen for the loss of any one sensor, too; by default as constraints say.
             workers: Processes that look at training scenes, or the address of a dask scheduler, tcp://HOST:PORT.
             notes: Called with every note; they are logged by default.
             progress: Called with every step, as "choosing 361 rays", and twice None.
@@ -176,6 +178,7 @@ class Run(RunFolder):
             name=name,
             seed=seed,
             certify=certify,
+            survive=survive,
         )
         request = FitRequest.resolve(self, options, notes=notes)
         return Design.fitted(request, workers=workers, notes=notes, progress=progress)
@@ -246,6 +249,7 @@ class Run(RunFolder):
         return_tolerance: float | None = None,
         settings: Sequence[str] | Mapping[str, Any] = (),
         mount_error: str | None = None,
+        losses: bool = False,
         workers: int | str = 1,
         cma_seconds: float | None = None,
         accuracy: bool = False,
@@ -268,6 +272,7 @@ class Run(RunFolder):
             return_tolerance: Largest share of returns changed by all skipped effects together.
             settings: Settings of the task, to score in scenes other than the learned ones.
             mount_error: Standard deviations of mounting errors of sensors in further rows, as "5mm,0.5deg".
+            losses: Whether designs are scored with each of their sensors lost, too; those made for it always are.
             workers: Processes that score scenes, or the address of a dask scheduler, tcp://HOST:PORT.
             cma_seconds: Wall time of each search of the baseline cma [s].
             accuracy: Whether the sweeps of accuracy are measured, too; takes minutes.
@@ -293,6 +298,7 @@ class Run(RunFolder):
             return_tolerance=return_tolerance,
             settings=settings,
             mount_error=mount_error,
+            losses=losses,
             workers=workers,
             cma_seconds=cma_seconds,
             accuracy=accuracy,

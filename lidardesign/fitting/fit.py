@@ -23,7 +23,7 @@ from lidardesign.constraints.document import Constraints, merged
 from lidardesign.constraints.feasibility import check_feasible
 from lidardesign.constraints.origins import placement_notes
 from lidardesign.errors import BackgroundNote, DataError, InfeasibleError
-from lidardesign.fitting.request import BEST, COUNTS, KEY, FitRequest, FitResult, RunTarget, Weighting
+from lidardesign.fitting.request import BEST, COUNTS, KEY, FitRequest, FitResult, RunTarget, Weighting, check_several
 from lidardesign.fitting.trials import HeldBackScenes, best_of, trials_of
 from lidardesign.formats.designs import relative_folder
 from lidardesign.mixture.fit import FitProblem, FittedSensors, fit_sensors
@@ -47,6 +47,8 @@ if TYPE_CHECKING:
 
 # A larger share of scenes without information from a design is noted.
 MOST_SILENT = 0.5
+# So much of what sensors see is seen by several, or a note says so where a sensor may fail.
+LEAST_SHARED = 0.9
 # As many samples as the standard preset of `learn` leaves.
 TWIN_SAMPLES = 100_000
 TWIN_NAME = "no-visibility"
@@ -208,8 +210,7 @@ class Fitter:
 
     def _without_idle(self, count: int) -> FitResult:
         """The design of at most `count` sensors, fewer while any would fire no ray or rest on too few samples."""
-        bounds = self.request.constraints
-        least = max(bounds.sensors.min or 1, len(bounds.each))
+        least = self.request.constraints.least_sensors
         while count > least:
             try:
                 result = self._fitted(replace(self.request, sensors=count), may_idle=True)
@@ -257,6 +258,8 @@ class Fitter:
         started, constraints, counts = time.perf_counter(), request.constraints, request.counts
         is_chosen = request.layout == "chosen"
         fitted = self._sensors(request, constraints, counts[-1] if is_chosen else request.rays)
+        if constraints.survive:
+            check_several(len(fitted.sensors))
         design = DesignSpec(
             name=request.name,
             sensors=fitted.sensors,
@@ -289,6 +292,11 @@ class Fitter:
                 notes.append(
                     f"about {chosen.silent:.0%} of the training scenes that were held back, no ray tells anything; "
                     "where that is not expected, check that places, directions and gates are right, and in metres"
+                )
+            if chosen.shared < LEAST_SHARED:
+                notes.append(
+                    f"constraints let several sensors see {chosen.shared:.0%} of what they see together: the rest is "
+                    "lost with its sensor; allow wider fields of view or gates"
                 )
         elif fitted.rays is not None:
             design = replace(design, constraints=merged(design.constraints, {"budget": {"rays": fitted.rays}}))
@@ -394,6 +402,8 @@ def twin_without_visibility(
     seed = seed if isinstance(seed, int) else 0
     drawn = twin_samples(run) if samples is None else samples()
     document = {key: value for key, value in design.constraints.items() if key != "parts"}
+    if rays == 1:
+        document.pop("survive", None)
     # a bandwidth is one of evaluations, whatever bits the design was made for
     budget = document.get("budget", {}) if bandwidth_mbps is None else {"bandwidth_mbps": bandwidth_mbps}
     document["budget"] = {**budget, "rays": rays}

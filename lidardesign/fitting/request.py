@@ -6,6 +6,7 @@ the run's samples and its target density.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -69,6 +70,7 @@ class FitOptions:
         name: The design's name.
         seed: Seed of all random numbers; the run's by default.
         certify: Whether every number of rays gets a certificate, not the middle one alone.
+        survive: 1: rays are chosen for the loss of any one sensor, too; by default as constraints say.
 
     Raises:
         ConfigError: An invalid name, layout or choice of gates.
@@ -88,6 +90,7 @@ class FitOptions:
     name: str | None = None
     seed: int | None = None
     certify: bool = False
+    survive: int | None = None
 
     def __post_init__(self) -> None:
         if self.name is not None and not NAME_PATTERN.fullmatch(self.name):
@@ -101,6 +104,7 @@ class FitOptions:
             allowed = f"a whole number from 1 to {MOST_FITTED}, or best"
             raise ConfigError(repr(self.sensors), where="--sensors", allowed=allowed)
         limits = {"rays": (1, MOST_RAYS), "channels": (1, MOST_FITTED), "seed": (0, MAX_SEED)}
+        limits["survive"] = (0, 1)
         for name, (low, high) in limits.items():
             if getattr(self, name) is not None:
                 check_number(getattr(self, name), f"--{name}", low, high, whole=True)
@@ -173,12 +177,16 @@ class FitRequest:
         asked = load_constraints(options.constraints, notes=notes)
         if asked is None and base is not None:
             asked = Constraints()
-        constraints, names = _with_rig(options, _with_parts(options, asked, run), run, notes)
+        constraints, names = _with_rig(options, _with_survival(options, _with_parts(options, asked, run)), run, notes)
         rules, moved = snap_to_space(constraints or Constraints(), run.config.space)
         for note in moved:
             notes(note)
         layout = _layout(rules, base, run, options)
         _check_layout(layout, rules, run, options)
+        sensors = _sensors(options.sensors, rules, base, layout)
+        most = sensors if isinstance(sensors, int) else rules.sensors.max or math.inf
+        if rules.survive:
+            check_several(most)
         at = {**(base.at if base else {}), **options.at}
         space = run.config.space.at(at)
         if layout != "spinning" and rules.parts is None:
@@ -196,7 +204,7 @@ class FitRequest:
             constraints=rules,
             is_constrained=constraints is not None,
             at=at,
-            sensors=_sensors(options.sensors, rules, base, layout),
+            sensors=sensors,
             layout=layout,
             rays=_rays(options.rays, rules, base),
             gates=_gates(options.gates, base, space, layout),
@@ -277,12 +285,16 @@ def _check_layout(layout: LayoutName, constraints: Constraints, run: RunFolder, 
             allowed="tasks with informs",
             hint="--layout even, or give the task a method informs(scene, returns)",
         )
+    place = f"the layout {layout}" if constraints.parts is None else "a design of real parts"
     faults = {
         (f"{options.channels} channels in the layout {layout}", "--channels", "--layout spinning"): (
             options.channels is not None and layout != "spinning"
         ),
         (f"a gate per ray in the layout {layout}", "--gates", "--layout chosen"): (
             options.gates == "ray" and layout != "chosen" and constraints.parts is None
+        ),
+        (f"sensors that may fail in {place}", "survive", "--layout chosen, without parts"): (
+            bool(constraints.survive) and place != "the layout chosen"
         ),
         ("spinning sensors with --at or --weight", "--layout", "chosen, even"): (
             layout == "spinning" and (bool(options.at) or bool(options.weights))
@@ -362,6 +374,26 @@ def _with_parts(options: FitOptions, asked: Constraints | None, run: RunFolder) 
                 fault, where="--parts", allowed="--parts NAME,NAME --sensors N, or parts.names, parts.count"
             )
     return asked
+
+
+def _with_survival(options: FitOptions, asked: Constraints | None) -> Constraints | None:
+    """The constraints with the user's word on sensors that may fail."""
+    if options.survive is None or (asked is None and not options.survive):
+        return asked
+    document = {} if asked is None else asked.as_document()
+    return Constraints.from_mapping({**document, "survive": options.survive})
+
+
+def check_several(sensors: float) -> None:
+    """Refuse a single sensor that may fail.
+
+    Raises:
+        ConfigError: Fewer than two sensors.
+    """
+    if sensors < 2:
+        raise ConfigError(
+            "a single sensor that may fail", where="survive", allowed="2 sensors or more", hint="--sensors 2"
+        )
 
 
 def _sensors(

@@ -18,10 +18,9 @@ from lidardesign.fitting.request import FitRequest
 from lidardesign.rays.information import FEW_SCENES, MOST_SCENES
 from lidardesign.rays.selection import SHARE_PER_BANDWIDTH
 from lidardesign.rays.training import HELD_BACK, TrainingScenes
-from lidardesign.run.clock import phase
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Scene, group_numbers
-from lidardesign.scoring.scene_scores import score_lists
+from lidardesign.scoring.scene_scores import score_lists, without_each
 from lidardesign.sensors.bandwidth import Bandwidth, mean_mbps
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.simulate.plan import Planner
@@ -39,12 +38,19 @@ class Trial:
     Arguments:
         sensors: Its number of sensors.
         fired: Its rays at each value of a condition.
+        survives: Whether the mean score over the loss of each sensor counts as much as that of all sensors.
         scores: Its score on each scene so far.
     """
 
     sensors: int
     fired: tuple[Rays, ...]
+    survives: bool = False
     scores: np.ndarray = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def lists(self) -> list[tuple[Rays, ...]]:
+        """What is scored: all its rays and, where losses count, those that are left by the loss of each sensor."""
+        return [self.fired, *(without_each(self.fired, self.sensors) if self.survives else [])]
 
     @property
     def mbps(self) -> float:
@@ -70,7 +76,6 @@ class HeldBackScenes:
         """The group of each scene so far."""
         return group_numbers(self.scenes)
 
-    @phase("trials")
     def score(self, trials: Sequence[Trial], count: int) -> None:
         """Score trials, which were scored on all scenes so far, on as many further scenes as are missing to `count`."""
         run, known = self.training.run, len(self.scenes)
@@ -82,12 +87,14 @@ class HeldBackScenes:
         )
         rows = []
         for scene in new:
-            casters, fired = build_casters(scene), [trial.fired for trial in trials]
+            casters, lists = build_casters(scene), [trial.lists for trial in trials]
             if self.planner is not None and not self.scenes:
-                plan = self.planner.plan(scene, [rays for one in fired for rays in one], casters)
+                plan = self.planner.plan(scene, [rays for trial in trials for rays in trial.fired], casters)
                 self._physics = self.planner.physics(plan, self.training.seed)
-            found = score_lists(run.task, run.metric, scene, fired, casters, self._physics)
-            rows.append([score.value for score, _ in found])
+            jobs = list(itertools.chain(*lists))
+            found = iter(score_lists(run.task, run.metric, scene, jobs, casters, self._physics))
+            values = [[next(found)[0].value for _ in own] for own in lists]
+            rows.append([(one[0] + np.mean(one[1:] or one)) / 2 for one in values])
             self.scenes.append(scene)
         for trial, column in zip(trials, np.array(rows).T, strict=True):
             trial.scores = np.append(trial.scores, column)
@@ -121,8 +128,7 @@ def trials_of(request: FitRequest, fit: Callable[[FitRequest], DesignSpec], coun
 
 def allowed_counts(constraints: Constraints, counts: Sequence[int]) -> list[int]:
     """Those of some numbers of sensors that constraints allow, or the least that they allow."""
-    low = max(constraints.sensors.min or 1, len(constraints.each))
-    high = constraints.sensors.max or math.inf
+    low, high = constraints.least_sensors, constraints.sensors.max or math.inf
     return [count for count in counts if low <= count <= high] or [low]
 
 
@@ -130,7 +136,8 @@ def trial_of(request: FitRequest, design: DesignSpec, rays: int) -> Trial:
     """A design with so many rays, wherever the request's sensors are."""
     run = request.run
     conditions = [{**request.at, **one} for one in run.conditions(run.config.space.at(request.at))]
-    return Trial(len(design.sensors), tuple(design.rays(rays, at=at or None) for at in conditions))
+    fired = tuple(design.rays(rays, at=at or None) for at in conditions)
+    return Trial(len(design.sensors), fired, request.constraints.survive > 0)
 
 
 def best_of(trials: Sequence[Trial], scenes: HeldBackScenes, metric: Metric) -> Trial:

@@ -262,4 +262,9 @@ def choose_within(
             high, tried = middle, bits
         else:
             low = middle
-    return _choose_layers(coverage, counts, (high, low, 0.0), budget_mbps, full=full, passes=passes)
+    found = _choose_layers(coverage, counts, (high, low, 0.0), budget_mbps, full=full, passes=passes)
+    if full and len(found.rays) < len(free.rays):
+        # swaps spent what further layers need
+        plain = choose(coverage, counts, price=high, passes=0)
+        return plain if plain.bits <= budget_mbps else found
+    return found

@@ -100,3 +100,9 @@ def _resampled_means(
         drawn = generator.integers(0, len(sums), (min(piece, resamples - start), len(sums)))
         means.append(sums[drawn].mean(axis=1) / counts[drawn].mean(axis=1))
     return np.concatenate(means)
+
+
+def worst_tenth(values: np.ndarray, better: str) -> float:
+    """The mean of the worst tenth of values, (N,), and of the worst one at least; `better` is lower or higher."""
+    ordered = np.sort(values)[:: -1 if better == "lower" else 1]
+    return float(ordered[: math.ceil(len(ordered) / 10)].mean())

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from support.coverages import SUMS, relaxed_by_highs, small
 
@@ -190,6 +190,15 @@ def test_where_no_ray_tells_anything_as_many_fire_as_fit(seed, spare):
     coverage = replace(coverage, worth=np.zeros_like(coverage.worth))
     budget = spare * np.sort(coverage.bits.min(axis=1))[:3].sum()
     assert len(choose_within(coverage, RayCounts.of_one(len(coverage.bits), 3), budget).rays) == 3
+
+
+@given(seeds, st.integers(1, 6), st.floats(1e-3, 10))
+@example(200, 3, 10.0 ** np.random.default_rng(200).uniform(-3, 1))
+def test_a_budget_that_is_enough_for_rays_at_some_price_is_enough_for_as_many(seed, count, price):
+    coverage = small(seed, rays=20, gates=3, items=4)
+    counts = RayCounts(np.random.default_rng(seed).integers(0, 3, 20), np.array([count, 3, 3]))
+    known = choose(coverage, counts, price=price, passes=0)
+    assert len(choose_within(coverage, counts, known.bits).rays) == len(known.rays)
 
 
 @pytest.mark.parametrize("price", [0.0, 0.002])

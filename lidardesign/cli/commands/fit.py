@@ -36,6 +36,7 @@ def fit(
     name: options.Name = "fit",
     seed: options.Seed = None,
     certify: options.Certify = False,
+    survive: options.Survive = None,
     workers: options.Workers = "1",
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -61,6 +62,7 @@ def fit(
             name=name,
             seed=seed,
             certify=certify,
+            survive=survive,
         )
         run_fit(FitRequest.resolve(RunFolder.open(run), chosen, notes=output.remark), output, workers)
 
@@ -125,6 +127,7 @@ def constrain(
     name: options.Name = "constrained",
     seed: options.Seed = None,
     certify: options.Certify = False,
+    survive: options.Survive = None,
     workers: options.Workers = "1",
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -152,6 +155,7 @@ def constrain(
             name=name,
             seed=seed,
             certify=certify,
+            survive=survive,
         )
         run, design = open_target(target, output.remark)
         run_fit(FitRequest.resolve(need_run(run, target), chosen, design, notes=output.remark), output, workers)

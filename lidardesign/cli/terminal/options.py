@@ -192,6 +192,11 @@ Certify = Annotated[
         "--certify", help="Bound what any other choice could gain at every number of rays, not the middle one."
     ),
 ]
+Survive = Annotated[
+    int | None,
+    typer.Option("--survive", metavar="0|1", help="1: choose for the loss of any one sensor.", show_default="0"),
+]
+Losses = Annotated[bool, typer.Option("--losses", help="Also score designs with each of their sensors lost.")]
 Preset = Annotated[
     str | None,
     typer.Option(

@@ -30,7 +30,8 @@ if TYPE_CHECKING:
     from lidardesign.scoring.evaluation.entries import StrongestBaseline
 
 ROW_KEYS = (
-    "design", "rays", "value", "ci_low", "ci_high", "half_width", "failures", "bandwidth_mbps", "seconds",
+    "design", "rays", "value", "ci_low", "ci_high", "half_width", "worst_decile", "failures", "bandwidth_mbps",
+    "seconds",
 )  # fmt: skip
 
 
@@ -68,6 +69,9 @@ class Row(_WithInterval):
         details: The task's further figures by name, each a mean over the scenes that give it.
         groups: The number of every scene's group, shape (S,); None: every scene is its own.
         per_seed: Over several seeds the mean of each, to which `value` and `per_scene` are means.
+        worst_decile: The mean score in the worst tenth of the scenes.
+        lost: The mean score with each of the design's sensors lost, where that was asked for.
+        better: lower or higher, as of the metric.
     """
 
     design: str
@@ -85,6 +89,14 @@ class Row(_WithInterval):
     details: Mapping[str, float] = field(default_factory=dict)
     groups: np.ndarray | None = None
     per_seed: tuple[float, ...] = ()
+    worst_decile: float | None = None
+    lost: tuple[float, ...] = ()
+    better: str = "lower"
+
+    @property
+    def worst_lost(self) -> float | None:
+        """The mean score without the sensor whose loss costs most; None where that was not asked for."""
+        return (max if self.better == "lower" else min)(self.lost, default=None)
 
     @property
     def drawn_interval(self) -> tuple[float, float]:
@@ -98,6 +110,8 @@ class Row(_WithInterval):
             values |= {"matched_to": self.matched_to, "matched_rays": self.matched_rays}
         if self.per_seed:
             values["per_seed"] = list(self.per_seed)
+        if self.lost:
+            values |= {"lost": list(self.lost), "worst_lost": self.worst_lost}
         return values
 
 
@@ -422,6 +436,8 @@ def csv_text(evaluation: Evaluation) -> str:
         "seconds [s]",
         "matched_to",
         "matched_rays",
+        f"worst decile [{unit}]",
+        f"worst sensor lost [{unit}]",
     )
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
@@ -440,6 +456,8 @@ def csv_text(evaluation: Evaluation) -> str:
                 row.seconds,
                 _no_formula(row.matched_to or ""),
                 "" if row.matched_rays is None else row.matched_rays,
+                row.worst_decile,
+                row.worst_lost,
             )
         )
     return buffer.getvalue()

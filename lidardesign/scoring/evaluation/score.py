@@ -28,8 +28,8 @@ from lidardesign.scoring.evaluation.entries import Entry, effect_notes, effect_s
 from lidardesign.scoring.evaluation.mounting import MountError
 from lidardesign.scoring.evaluation.request import EvaluationRequest, left_out
 from lidardesign.scoring.evaluation.results import Audit, Evaluation, Mounting, Paired, Row, audit_rows, middle_rays
-from lidardesign.scoring.scene_scores import RaysPerCondition, score_scenes, silent_notes
-from lidardesign.scoring.statistics import FEWEST_RESAMPLED, mean_interval, paired_difference
+from lidardesign.scoring.scene_scores import RaysPerCondition, score_scenes, silent_notes, without_each
+from lidardesign.scoring.statistics import FEWEST_RESAMPLED, mean_interval, paired_difference, worst_tenth
 from lidardesign.sensors.compare import outside_notes
 from lidardesign.sensors.sensor import MOST_RAYS
 from lidardesign.simulate.calibration import light_notes
@@ -64,11 +64,12 @@ def evaluate(request: EvaluationRequest, progress: Progress | None = None) -> Ev
     """
     request.check()
     entries = entries_of(request)
-    passes = 1 + request.audit + (request.mount_error is not None)
+    passes = 1 + request.audit + bool(request.losing) + (request.mount_error is not None)
     scored = _score_all(request, entries, request.planner, _part(progress, 0, passes))
-    rows = _rows(request, entries, scored)
+    losses = _losses(request, entries, scored.plans, _part(progress, 1, passes)) if request.losing else {}
+    rows = [replace(row, lost=losses.get(n, ())) for n, row in enumerate(_rows(request, entries, scored))]
     effects = effect_summaries(scored.plans)
-    audit = _audit(request, entries, rows, scored.plans, _part(progress, 1, passes)) if request.audit else None
+    audit = _audit(request, entries, rows, scored.plans, _part(progress, passes - 2, passes)) if request.audit else None
     last = _part(progress, passes - 1, passes)
     mounting = request.mount_error and _mounting(request, request.mount_error, entries, rows, scored.plans, last)
     searches = [entry.search for entry in entries if entry.search is not None]
@@ -124,6 +125,25 @@ def _audit(
         skipped=[planned.name for planned, every in paired if every.scenes_on > planned.scenes_on],
         unavailable=[every.name for _, every in paired if every.missing is not None],
     )
+
+
+@phase("losses")
+def _losses(
+    request: EvaluationRequest, entries: Sequence[Entry], plans: Sequence[EffectPlan], progress: Progress | None
+) -> dict[int, tuple[float, ...]]:
+    """The mean score of entries without each of their sensors, by the entry's number, under the same effects."""
+    lost = {
+        (number, sensor): replace(entry, name=f"{entry.name}/{sensor}", positions=left)
+        for number, entry in enumerate(entries)
+        if not entry.baseline and entry.name in request.losing
+        for sensor, left in enumerate(without_each(entry.positions, request.losing[entry.name]))
+    }
+    scored = _score_all(request, list(lost.values()), request.planner, progress, plans)
+    means = [
+        (number, float(np.mean([score.value for score, _ in scored.scores[entry.key]])))
+        for (number, _), entry in lost.items()
+    ]
+    return {own: tuple(mean for number, mean in means if number == own) for own, _ in means}
 
 
 @phase("mounting")
@@ -200,6 +220,8 @@ def _row(request: EvaluationRequest, entry: Entry, scores: Sequence[tuple[Score,
         matched_to=entry.matched_to,
         matched_rays=entry.matched_rays,
         groups=groups,
+        worst_decile=worst_tenth(values, request.metric.better),
+        better=request.metric.better,
     )
 
 

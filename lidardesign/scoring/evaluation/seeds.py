@@ -132,6 +132,7 @@ def _table(per_scene: np.ndarray, groups: np.ndarray | None) -> np.ndarray:
 def _mean_row(rows: Sequence[Row]) -> Row:
     values = np.stack([row.per_scene for row in rows])
     mean, low, high = two_way_interval(_table(values, rows[0].groups))
+    deciles, numbers = [row.worst_decile for row in rows], {len(row.lost) for row in rows}
     names = [name for name in rows[0].details if all(name in row.details for row in rows)]
     return replace(
         rows[0],
@@ -145,6 +146,9 @@ def _mean_row(rows: Sequence[Row]) -> Row:
         per_scene=values.mean(axis=0),
         details={name: float(np.mean([row.details[name] for row in rows])) for name in names},
         per_seed=tuple(values.mean(axis=1).tolist()),
+        worst_decile=None if None in deciles else float(np.mean(deciles)),
+        # which sensor is the first says nothing over seeds: from the least score to the largest
+        lost=tuple(np.mean([sorted(row.lost) for row in rows], axis=0).tolist()) if len(numbers) == 1 else (),
     )
 
 
