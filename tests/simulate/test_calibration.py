@@ -84,12 +84,6 @@ def test_parts_see_less_in_more_light_and_further_away():
     assert shares[0] > shares[1] > shares[2]
 
 
-def test_the_brightest_statement_counts_and_white_is_taken_where_no_reflectance_is_stated(ranger):
-    claim = Claim.of(find_part(ranger))
-    assert (claim.range_m, claim.reflectance, claim.klux, claim.share) == (0.9, 0.18, 20, 0.9)
-    assert Claim.of(find_part("tmf8828")).reflectance == 0.9
-
-
 def test_light_is_the_detector_s_own_where_nothing_is_stated_or_nothing_counted():
     unknown, known = of_part(find_part("vl53l8cx")), of_part(find_part("vl53l5cx"))
     assert with_part_light(unknown.rays(), unknown, ZONES).light is None
@@ -110,12 +104,13 @@ def test_reaches_are_stated_reckoned_or_unknown():
     assert "unknown / unknown" in reach_of(find_part("vl53l8cx")).as_text().values()
 
 
-def test_a_gate_beyond_what_a_part_reaches_is_noted(ranger):
+def test_the_brightest_statement_counts_and_a_gate_beyond_any_is_noted(ranger):
     design = of_part(find_part(ranger), 1, [ranger])
     assert [part.name for part in parts_of(design)] == ["ranger"]
     assert reaches_of(design)[0].dark_m == 2.0
+    claim = Claim.of(find_part(ranger))
+    assert (claim.range_m, claim.reflectance, claim.klux, claim.share) == (0.9, 0.18, 20, 0.9)
     (note,) = reach_notes(design)
     assert "listens to 3 m" in note
     assert not reach_notes(of_part(find_part("vl53l5cx")))
-    # a part that is not at hand is not known
     assert parts_of(of_part(find_part(ranger))) == [None]

@@ -24,7 +24,6 @@ from lidardesign.simulate.plan import Planner
 from lidardesign.simulate.returns import build_casters, photon_histograms, simulate
 
 ALL = frozenset({*PHOTON_EFFECTS, "atmosphere"})
-# dim enough that detection is chance
 ROOM = Scene((Body(Sphere(1.5), reflectance=0.02),), ambient=Ambient(3000.0), medium=Medium(0.05, 0.005))
 DETECTORS = {name: load_detector(name) for name in ("single-photon", "consumer-8x8")}
 both = pytest.mark.parametrize("detector", DETECTORS.values(), ids=DETECTORS)
@@ -60,7 +59,6 @@ def test_each_of_two_sensors_has_the_light_of_one_alone(detector):
     alone, pair = histograms(fan(), detector), histograms(two_sensors(), detector)
     np.testing.assert_array_equal(pair.counts[:40], alone.counts)
     np.testing.assert_array_equal(pair.pulses, np.tile(alone.pulses, 2))
-    # without chance, the other sensor's too
     steady = frozenset({"quantisation"})
     np.testing.assert_array_equal(
         histograms(two_sensors(), detector, steady).counts[40:], histograms(fan(40, 1), detector, steady).counts
