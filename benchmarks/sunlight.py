@@ -57,7 +57,7 @@ def add_scene(request: Any, entries: list[Any], tallies: list[Tally], scene: Any
     from lidardesign.simulate.returns import build_casters, simulate_many
 
     casters = build_casters(scene)
-    lists = [entry.positions[0] for entry in entries]
+    lists = [entry.lit_in(0)[0] for entry in entries]
     plan = request.planner.plan(scene, lists, casters)
     variants = {"all": plan.effects, "calm": plan.effects - {"ambient"}, "single": plan.effects - {"pile_up"}}
     for name, effects in variants.items():

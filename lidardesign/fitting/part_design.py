@@ -122,6 +122,11 @@ def choose_parts(
     if len(chosen.members) < count:
         notes(f"{len(chosen.members)} of {count} parts: no further part tells more or fits the bounds")
     design = _design(name, constraints, [placed[member] for member in chosen.members], budget.rays)
+    # it traces rays, which fits without parts do without
+    from lidardesign.simulate.calibration import reach_notes
+
+    for line in reach_notes(design):
+        notes(line)
     certificate = certificate_document(
         rays=design.count or 0,
         value=coverage.complete - chosen.value,
