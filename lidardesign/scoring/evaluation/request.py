@@ -42,7 +42,7 @@ class EvaluationRequest:
         task: The task that scores.
         config: The task's configuration; its condition values are evaluated at.
         space: The design space that baselines fill.
-        seed: Root of the drawn baselines and the bootstrap.
+        seed: Root of the drawn baselines.
         designs: The designs, by distinct names that are no baseline's.
         rays: Numbers of rays per frame; with conditions, per condition value. See `numbers_fired`.
         baselines: Names of baselines.

@@ -21,7 +21,7 @@ from lidardesign.estimates import HALF_INTERVAL, Estimate, as_documents
 from lidardesign.run.files import write_atomic
 from lidardesign.scoring.evaluation.entries import EffectSummary
 from lidardesign.scoring.evaluation.mounting import MountError
-from lidardesign.scoring.statistics import paired_difference
+from lidardesign.scoring.statistics import Interval, paired_difference
 from lidardesign.scoring.sweep import Accuracy
 from lidardesign.task import Metric
 
@@ -125,6 +125,7 @@ class Paired(_WithInterval):
         difference: Negative where a is lower.
         ci_low, ci_high: Ends of the interval; None where all scenes are of one group.
         rays_b: Rays per frame of b, where they differ: the comparison at equal bandwidth.
+        percent: By how much a's mean is above b's [%], by logarithms; None where a mean is not above 0.
     """
 
     a: str
@@ -134,6 +135,7 @@ class Paired(_WithInterval):
     ci_low: float | None
     ci_high: float | None
     rays_b: int | None = None
+    percent: Interval | None = None
 
     @property
     def drawn_interval(self) -> tuple[float, float]:
@@ -141,9 +143,10 @@ class Paired(_WithInterval):
         return self._drawn(self.difference)
 
     def as_dict(self) -> dict[str, Any]:
-        """The contract's keys and `half_width`, with `rays_b` at equal bandwidth."""
+        """The contract's keys, `half_width` and `percent`, with `rays_b` at equal bandwidth."""
         names = ("a", "b", "rays", "difference", "ci_low", "ci_high", "half_width")
         values = {name: getattr(self, name) for name in names}
+        values["percent"] = self.percent and list(self.percent)
         return values if self.rays_b is None else {**values, "rays_b": self.rays_b}
 
 
@@ -403,7 +406,7 @@ class Audit:
         }
 
 
-def audit_rows(planned: Sequence[Row], everything: Sequence[Row], seed: int) -> list[AuditRow]:
+def audit_rows(planned: Sequence[Row], everything: Sequence[Row], metric: Metric) -> list[AuditRow]:
     """The same rows under both, paired."""
     return [
         AuditRow(
@@ -411,7 +414,7 @@ def audit_rows(planned: Sequence[Row], everything: Sequence[Row], seed: int) -> 
             row.rays,
             row.value,
             other.value,
-            *paired_difference(row.per_scene, other.per_scene, seed, row.groups),
+            *paired_difference(row.per_scene, other.per_scene, row.groups, limits=metric.limits),
             row.seconds,
             other.seconds,
             row.matched_to,
