@@ -36,6 +36,8 @@ def fit(
     name: options.Name = "fit",
     seed: options.Seed = None,
     certify: options.Certify = False,
+    goal: options.Goal = None,
+    least: options.Least = None,
     workers: options.Workers = "1",
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -61,6 +63,8 @@ def fit(
             name=name,
             seed=seed,
             certify=certify,
+            goal=goal,
+            least=least,
         )
         run_fit(FitRequest.resolve(RunFolder.open(run), chosen, notes=output.remark), output, workers)
 
@@ -125,6 +129,8 @@ def constrain(
     name: options.Name = "constrained",
     seed: options.Seed = None,
     certify: options.Certify = False,
+    goal: options.Goal = None,
+    least: options.Least = None,
     workers: options.Workers = "1",
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -152,6 +158,8 @@ def constrain(
             name=name,
             seed=seed,
             certify=certify,
+            goal=goal,
+            least=least,
         )
         run, design = open_target(target, output.remark)
         run_fit(FitRequest.resolve(need_run(run, target), chosen, design, notes=output.remark), output, workers)

@@ -192,6 +192,15 @@ Certify = Annotated[
         "--certify", help="Bound what any other choice could gain at every number of rays, not the middle one."
     ),
 ]
+Goal = Annotated[
+    float | None,
+    typer.Option("--goal", metavar="SCORE", help="Keep this score with as little as it takes.", show_default=False),
+]
+LEAST = "bandwidth|rays|sensors|parts"
+Least = Annotated[
+    str | None,
+    typer.Option("--least", metavar=LEAST, help="What --goal saves; else bandwidth.", autocompletion=words(LEAST)),
+]
 Preset = Annotated[
     str | None,
     typer.Option(
