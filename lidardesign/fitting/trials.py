@@ -58,12 +58,9 @@ class Trial:
 
     def fires_as(self, other: Trial) -> bool:
         """True where another design fires the same rays."""
-        columns = ("origin_m", "direction", "gate_m", "sensor")
-        return len(self.fired) == len(other.fired) and all(
-            np.array_equal(getattr(mine, name), getattr(its, name))
-            for mine, its in zip(self.fired, other.fired, strict=True)
-            for name in columns
-        )
+        names = ("origin_m", "direction", "gate_m", "sensor")
+        mine, its = ([getattr(rays, name) for rays in one.fired for name in names] for one in (self, other))
+        return all(map(np.array_equal, mine, its))
 
 
 class HeldBackScenes:
@@ -184,21 +181,17 @@ class GoalTrial:
 
     Arguments:
         request: The request that it is the design of.
+        cost: How much it has of what is to be least.
         trial: The design, with its scores.
         score: Their mean with its interval.
         keeps: Whether the interval keeps the goal.
     """
 
     request: FitRequest
+    cost: float
     trial: Trial
     score: Interval
     keeps: bool
-
-    @property
-    def cost(self) -> float:
-        """How much it has of what is to be least."""
-        costs = {"bandwidth": _mbps(self.request, self.trial), "rays": len(self.trial.fired[0])}
-        return costs.get(self.request.least, self.trial.sensors)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values."""
@@ -235,6 +228,8 @@ class GoalSearch:
 
     def __init__(self, request: FitRequest, fit: Callable[[FitRequest], DesignSpec], scenes: HeldBackScenes) -> None:
         self.request, self.metric, self.scenes, self._fit = request, request.run.metric, scenes, fit
+        budget = request.constraints.budget
+        self._model = Bandwidth(budget.bin_ps, budget.bits_per_bin, budget.rate_hz)
         self.tried: list[GoalTrial] = []
         self._refused: InfeasibleError | None = None
 
@@ -297,7 +292,9 @@ class GoalSearch:
         if trial is None:
             return None
         same = next((one for one in self.tried if one.trial.fires_as(trial)), None)
-        tried = GoalTrial(request, trial, *self._judged(trial)) if same is None else replace(same, request=request)
+        costs = {"bandwidth": self._mbps(trial), "rays": len(trial.fired[0])}
+        cost = costs.get(request.least, trial.sensors)
+        tried = replace(same, request=request) if same else GoalTrial(request, cost, trial, *self._judged(trial))
         self.tried.append(tried)
         return tried.cost if tried.keeps else None
 
@@ -319,24 +316,25 @@ class GoalSearch:
 
     def _least_bandwidth(self, rays: int, limit: float) -> float:
         """The least bandwidth below a limit in which so many rays keep the goal; the limit where there is none."""
-        request, model = self._with_rays(rays), _read_out(self.request)
-        low = model.mbps_of_widths(np.zeros(1), rays)
+        request, low = self._with_rays(rays), self._model.mbps_of_widths(np.zeros(1), rays)
         free = self._fitted(request) if low <= limit else None
         if free is None:
             return limit
-        request = replace(request, is_constrained=True)
-        reached = least_keeping(
-            lambda mbps: self._reached(_with_budget(request, {"bandwidth_mbps": mbps})),
-            low,
-            min(limit, rounded_up(_mbps(request, free))),
-            rounded_up,
-        )
-        return reached or limit
+        high, bounded = rounded_up(min(limit, self._mbps(free))), replace(request, is_constrained=True)
+
+        def reached(mbps: float) -> float | None:
+            return self._reached(_with_budget(bounded, {"bandwidth_mbps": mbps}))
+
+        return least_keeping(reached, low, high, rounded_up) or limit
+
+    def _mbps(self, trial: Trial) -> float:
+        """The largest bandwidth of a design at any condition, by the model of its constraints [Mbit/s]."""
+        return max(map(self._model.mbps, trial.fired))
 
     def _missed(self) -> InfeasibleError:
-        """The error where nothing keeps the goal, which says what is best."""
-        if not self.tried:
-            return self._refused or InfeasibleError("nothing can be fitted", conflicts=["--goal"])
+        """The error where nothing keeps the goal, which says what is best, or why nothing can be fitted."""
+        if self._refused is not None and not self.tried:
+            return self._refused
         metric, is_lower = self.metric, self.metric.better == "lower"
         best = (min if is_lower else max)(self.tried, key=lambda one: one.score.mean)
         end = best.score.high if is_lower else best.score.low
@@ -376,17 +374,6 @@ def rounded_up(mbps: float) -> float:
     """A bandwidth rounded up to `DIGITS` digits [Mbit/s]."""
     decimals = DIGITS - 1 - math.floor(math.log10(mbps))
     return round(math.ceil(mbps * 10**decimals) / 10**decimals, max(decimals, 0))
-
-
-def _read_out(request: FitRequest) -> Bandwidth:
-    """The read-out model of a request's constraints."""
-    budget = request.constraints.budget
-    return Bandwidth(budget.bin_ps, budget.bits_per_bin, budget.rate_hz)
-
-
-def _mbps(request: FitRequest, trial: Trial) -> float:
-    """The largest bandwidth of a design at any condition, by the model of its constraints [Mbit/s]."""
-    return max(map(_read_out(request).mbps, trial.fired))
 
 
 def _with_budget(request: FitRequest, budget: dict[str, float]) -> FitRequest:

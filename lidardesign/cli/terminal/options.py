@@ -194,12 +194,14 @@ Certify = Annotated[
 ]
 Goal = Annotated[
     float | None,
-    typer.Option("--goal", metavar="SCORE", help="Keep this score with as little as it takes.", show_default=False),
+    typer.Option("--goal", metavar="SCORE", help="Score to keep, by the least that it takes.", show_default=False),
 ]
 LEAST = "bandwidth|rays|sensors|parts"
 Least = Annotated[
     str | None,
-    typer.Option("--least", metavar=LEAST, help="What --goal saves; else bandwidth.", autocompletion=words(LEAST)),
+    typer.Option(
+        "--least", metavar=LEAST, help="What --goal takes least of; else bandwidth.", autocompletion=words(LEAST)
+    ),
 ]
 Preset = Annotated[
     str | None,
