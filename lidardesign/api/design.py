@@ -114,6 +114,8 @@ class Design(DesignSource):
         seed: int | None = None,
         certify: bool = False,
         survive: int | None = None,
+        goal: float | None = None,
+        least: str | None = None,
         workers: int | str = 1,
         notes: Notes = log_note,
         progress: Progress | None = None,
@@ -136,6 +138,8 @@ class Design(DesignSource):
             seed: Seed of all random numbers; the run's by default.
             certify: Whether every number of rays gets a certificate, not the middle one alone.
             survive: 1: rays are chosen for the loss of any one sensor, too; by default as constraints say.
+            goal: The score that it has to keep on training scenes that were held back, in the metric's unit.
+            least: What it then has the least of: bandwidth (the default), rays, sensors or parts.
             workers: Processes that look at training scenes, or the address of a dask scheduler, tcp://HOST:PORT.
             notes: Called with every note.
             progress: Called with every step, as "choosing 361 rays", and twice None.
@@ -161,6 +165,8 @@ class Design(DesignSource):
             seed=seed,
             certify=certify,
             survive=survive,
+            goal=goal,
+            least=least,
         )
         request = FitRequest.resolve(run, options, self.specification, notes=notes)
         return Design.fitted(request, workers=workers, notes=notes, progress=progress)

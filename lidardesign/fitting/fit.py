@@ -2,7 +2,8 @@
 
 Where the number of sensors is open, designs of several numbers are fitted at the middle number of rays and scored on
 training scenes that were held back, each in the bandwidth that it takes. The fewest sensors within a standard error of
-the best are taken, where bandwidth has the price that it has for rays.
+the best are taken, where bandwidth has the price that it has for rays. For a goal the least that keeps it is found in
+the same way, and fitted again as if it had been asked for.
 
 A design's twin is fitted to the density without its occlusion term, without learning again: the baseline
 `no-visibility`.
@@ -24,7 +25,7 @@ from lidardesign.constraints.feasibility import check_feasible
 from lidardesign.constraints.origins import placement_notes
 from lidardesign.errors import BackgroundNote, DataError, InfeasibleError
 from lidardesign.fitting.request import BEST, COUNTS, KEY, FitRequest, FitResult, RunTarget, Weighting, check_several
-from lidardesign.fitting.trials import HeldBackScenes, best_of, trials_of
+from lidardesign.fitting.trials import GoalSearch, HeldBackScenes, best_of, trials_of
 from lidardesign.formats.designs import relative_folder
 from lidardesign.mixture.fit import FitProblem, FittedSensors, fit_sensors
 from lidardesign.mixture.support import LEAST_SAMPLES, MOVED_SAMPLES, Retarget, at_condition, condition_text
@@ -84,6 +85,8 @@ def fit_design(
     result = fitter.fit()
     for note in result.notes:
         notes(note)
+    # of a goal it is found
+    request = fitter.request
     run, design = request.run, result.design
     if len(request.names) == len(design.sensors):
         named = (replace(sensor, name=name) for sensor, name in zip(design.sensors, request.names, strict=True))
@@ -188,6 +191,11 @@ class Fitter:
         return moved
 
     @cached_property
+    def scenes(self) -> HeldBackScenes:
+        """The scenes that all trials are scored on."""
+        return HeldBackScenes(self.training)
+
+    @cached_property
     def pool(self) -> CandidatePool | None:
         """The pool of candidate rays at the sensors' place; None where their origins are free."""
         if not self.is_pooled:
@@ -200,13 +208,37 @@ class Fitter:
     def fit(self) -> FitResult:
         """The design of the request."""
         request = self.request
+        if request.goal is not None:
+            return self._to_goal()
         if request.constraints.parts is not None:
-            return self._parts()
+            return self._parts(request, self.notes)
         if request.layout == "spinning":
             return self._rings()
         if request.sensors == BEST:
             return self._without_idle(self._best_count())
         return self._fitted(request)
+
+    def _to_goal(self) -> FitResult:
+        """The design with the least that keeps the goal, as its request gives it without a goal."""
+        request = self.request
+        if request.sensors == BEST and request.least != "sensors":
+            request = replace(request, sensors=self._best_count())
+
+        def fit(asked: FitRequest) -> DesignSpec:
+            limit = asked.constraints.budget.bandwidth_mbps
+            named = {"sensors": asked.sensors, "rays": asked.rays, "Mbit/s": limit and f"{limit:g}"}
+            self.progress(f"trying {', '.join(f'{value} {name}' for name, value in named.items() if value)}")
+            if asked.constraints.parts is not None:
+                return self._parts(asked, ignore).design
+            return self._fitted(asked, certifies=False).design
+
+        with phase("trials"):
+            search = GoalSearch(request, fit, self.scenes)
+            found = search.found(COUNTS)
+        self.request = replace(found.request, goal=None)
+        for note in search.notes(found):
+            self.notes(note)
+        return replace(self.fit(), goal=search.as_dict(found))
 
     def _without_idle(self, count: int) -> FitResult:
         """The design of at most `count` sensors, fewer while any would fire no ray or rest on too few samples."""
@@ -247,13 +279,16 @@ class Fitter:
             )
         )
 
-    def _fitted(self, request: FitRequest, *, is_trial: bool = False, may_idle: bool = False) -> FitResult:
+    def _fitted(
+        self, request: FitRequest, *, is_trial: bool = False, may_idle: bool = False, certifies: bool = True
+    ) -> FitResult:
         """The design of a request whose number of sensors is known.
 
         Arguments:
             request: What is asked for.
             is_trial: Whether its number of sensors is being tried.
             may_idle: Whether sensors may be left without a ray.
+            certifies: Whether chosen rays get their certificates, which no ray depends on.
         """
         started, constraints, counts = time.perf_counter(), request.constraints, request.counts
         is_chosen = request.layout == "chosen"
@@ -282,7 +317,7 @@ class Fitter:
                 level=request.level,
                 gates=request.gates,
                 pool=self.pool,
-                certified=() if is_trial else counts if request.certify else (middle,),
+                certified=() if is_trial or not certifies else counts if request.certify else (middle,),
                 each_fires=not may_idle,
                 is_trial=is_trial,
                 progress=ignore if is_trial else self.progress,
@@ -315,19 +350,17 @@ class Fitter:
             self.progress(f"trying --sensors {trial.sensors}")
             return self._fitted(trial, is_trial=True, may_idle=True).design
 
-        scenes = HeldBackScenes(self.training)
         with phase("trials"):
             trials = trials_of(request, fit, COUNTS)
-            best = best_of(trials, scenes, metric)
+            best = best_of(trials, self.scenes, metric)
         found = ", ".join(f"{one.sensors}: {one.scores.mean():.4g} in {one.mbps:.3g} Mbit/s" for one in trials)
         text = f"sensors: {best.sensors}; {metric.name} [{metric.unit}] on {len(best.scores)} training scenes "
         self.notes(BackgroundNote(f"{text}by their number: {found}"))
         return best.sensors
 
-    def _parts(self) -> FitResult:
+    def _parts(self, request: FitRequest, notes: Notes) -> FitResult:
         from lidardesign.fitting.part_design import choose_parts
 
-        request = self.request
         return choose_parts(
             self.samples,
             request.constraints,
@@ -337,7 +370,7 @@ class Fitter:
             scenes=self.training.scenes,
             seed=request.seed,
             name=request.name,
-            notes=self.notes,
+            notes=notes,
             progress=self.progress,
         )
 

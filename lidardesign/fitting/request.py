@@ -11,6 +11,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
 
 BEST = "best"  # as many sensors as score best on training scenes
 COUNTS = (1, 2, 3, 4, 6, 8)  # of sensors, that are tried for that
+LEAST = ("bandwidth", "rays", "sensors", "parts")  # of what a design for a goal has as little as it can
 CHOSEN_LEVEL = 0.999  # rays are chosen inside fields and gates: narrower ones would only leave candidates out
 # Of designs: names that a file may have everywhere.
 NAME_PATTERN = re.compile(r"[^\W.][\w.+-]{0,99}")
@@ -71,9 +73,11 @@ class FitOptions:
         seed: Seed of all random numbers; the run's by default.
         certify: Whether every number of rays gets a certificate, not the middle one alone.
         survive: 1: rays are chosen for the loss of any one sensor, too; by default as constraints say.
+        goal: The score that the design has to keep on training scenes that were held back, in the metric's unit.
+        least: What it then has the least of: bandwidth, rays, sensors or parts.
 
     Raises:
-        ConfigError: An invalid name, layout or choice of gates.
+        ConfigError: An invalid name, layout, choice of gates or of what is least.
     """
 
     sensors: int | str | None = None
@@ -91,6 +95,8 @@ class FitOptions:
     seed: int | None = None
     certify: bool = False
     survive: int | None = None
+    goal: float | None = None
+    least: str | None = None
 
     def __post_init__(self) -> None:
         if self.name is not None and not NAME_PATTERN.fullmatch(self.name):
@@ -100,6 +106,8 @@ class FitOptions:
             check_choice(self.layout, "--layout", FITTED_LAYOUTS)
         if self.gates is not None:
             check_choice(self.gates, "--gates", get_args(Gates))
+        if self.least is not None:
+            check_choice(self.least, "--least", LEAST)
         if self.sensors not in (None, BEST, *range(1, MOST_FITTED + 1)):
             allowed = f"a whole number from 1 to {MOST_FITTED}, or best"
             raise ConfigError(repr(self.sensors), where="--sensors", allowed=allowed)
@@ -132,6 +140,8 @@ class FitRequest:
         channels: Rings of each sensor that spins.
         names: Names of the sensors, where there are as many; none numbers them.
         certify: Whether every number of rays gets a certificate.
+        goal: The score that it has to keep, with the least of `least`; None leaves nothing to be sought.
+        least: One of `LEAST`.
     """
 
     run: RunFolder
@@ -149,6 +159,8 @@ class FitRequest:
     channels: int | None
     names: Sequence[str]
     certify: bool
+    goal: float | None = None
+    least: str = LEAST[0]
 
     @classmethod
     def resolve(
@@ -187,6 +199,7 @@ class FitRequest:
         most = sensors if isinstance(sensors, int) else rules.sensors.max or math.inf
         if rules.survive:
             check_several(most)
+        _check_goal(layout, rules, run, options)
         at = {**(base.at if base else {}), **options.at}
         space = run.config.space.at(at)
         if layout != "spinning" and rules.parts is None:
@@ -213,6 +226,8 @@ class FitRequest:
             channels=channels,
             names=names,
             certify=options.certify,
+            goal=options.goal,
+            least=options.least or ("bandwidth" if rules.parts is None else "parts"),
         )
 
     @property
@@ -306,6 +321,37 @@ def _check_layout(layout: LayoutName, constraints: Constraints, run: RunFolder, 
     for (fault, where, allowed), is_found in faults.items():
         if is_found:
             raise ConfigError(fault, where=where, allowed=allowed)
+
+
+def _check_goal(layout: LayoutName, constraints: Constraints, run: RunFolder, options: FitOptions) -> None:
+    """Refuse a goal that no score can be held against, and what cannot be sought for one.
+
+    Raises:
+        ConfigError: There is one.
+    """
+    goal, least, metric, are_parts = options.goal, options.least, run.metric, constraints.parts is not None
+    faults = {
+        ("no goal", "--least", "--goal SCORE --least WHAT"): goal is None and least is not None,
+        ("a goal for sensors that spin", "--goal", "the layouts chosen and even"): (
+            goal is not None and layout == "spinning"
+        ),
+        (f"{least} of a design of parts", "--least", "parts"): are_parts and least not in (None, "parts"),
+        ("no parts are named", "--least parts", "--parts NAME,NAME"): not are_parts and least == "parts",
+        (f"{options.sensors} sensors, of which the least are sought", "--sensors", "sensors.max, or nothing"): (
+            least == "sensors" and isinstance(options.sensors, int)
+        ),
+    }
+    for (fault, where, allowed), is_found in faults.items():
+        if is_found:
+            raise ConfigError(fault, where=where, allowed=allowed)
+    if goal is not None:
+        low, high = (0.0 if metric.worst > 0 else -math.inf), metric.worst
+        if metric.better == "higher":
+            low, high = metric.worst, 100.0 if metric.unit == "%" else math.inf
+        is_number = isinstance(goal, Real) and not isinstance(goal, bool)
+        if not (is_number and math.isfinite(goal) and low <= goal <= high):
+            allowed = f"a number from {low:g} to {high:g} {metric.unit}"
+            raise ConfigError(f"{goal!r} as {metric.name}", where="--goal", allowed=allowed)
 
 
 def _check_conditions(constraints: Constraints, space: DesignSpace) -> None:
@@ -488,6 +534,7 @@ class FitResult:
         constraints: The independent checks.
         notes: Lines on sensors.
         error_estimates: Standard errors of log_likelihood, ess and admissible_mass.
+        goal: For a goal, what was tried, as plain values.
     """
 
     design: DesignSpec
@@ -498,6 +545,7 @@ class FitResult:
     constraints: tuple[ConstraintCheck, ...] = ()
     notes: tuple[str, ...] = ()
     error_estimates: Mapping[str, Estimate] = field(default_factory=dict)
+    goal: Mapping[str, Any] | None = None
 
     @classmethod
     def of_fit(cls, design: DesignSpec, fitted: FittedSensors, samples: Samples, seconds: float) -> FitResult:
@@ -529,6 +577,7 @@ class FitResult:
             "constraints": [check.as_dict() for check in self.constraints],
             "seconds": self.seconds,
             "error_estimates": as_documents(self.error_estimates),
+            **({} if self.goal is None else {"goal": dict(self.goal)}),
         }
 
 

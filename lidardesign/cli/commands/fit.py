@@ -37,6 +37,8 @@ def fit(
     seed: options.Seed = None,
     certify: options.Certify = False,
     survive: options.Survive = None,
+    goal: options.Goal = None,
+    least: options.Least = None,
     workers: options.Workers = "1",
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -63,6 +65,8 @@ def fit(
             seed=seed,
             certify=certify,
             survive=survive,
+            goal=goal,
+            least=least,
         )
         run_fit(FitRequest.resolve(RunFolder.open(run), chosen, notes=output.remark), output, workers)
 
@@ -128,6 +132,8 @@ def constrain(
     seed: options.Seed = None,
     certify: options.Certify = False,
     survive: options.Survive = None,
+    goal: options.Goal = None,
+    least: options.Least = None,
     workers: options.Workers = "1",
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -156,6 +162,8 @@ def constrain(
             seed=seed,
             certify=certify,
             survive=survive,
+            goal=goal,
+            least=least,
         )
         run, design = open_target(target, output.remark)
         run_fit(FitRequest.resolve(need_run(run, target), chosen, design, notes=output.remark), output, workers)
