@@ -154,8 +154,8 @@ def light_notes(design: DesignSpec, detector: Detector) -> list[str]:
         return []
     known = [name for name, part in kinds.items() if part_light(part, detector, part.rays) is not None]
     unknown = [name for name in kinds if name not in known]
-    lines = [f"the light of {', '.join(known)} is that with which data sheets keep their ranges in light"] * bool(known)
-    own = f"no source says how far {', '.join(unknown)} reach in light that {detector.name} can have: its own is taken"
+    lines = [f"light as data sheets imply: {', '.join(known)}"] * bool(known)
+    own = f"no range that {detector.name} could keep in some light is stated of {', '.join(unknown)}: its own is taken"
     return [*lines, *[own] * bool(unknown)]
 
 
