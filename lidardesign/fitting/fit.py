@@ -25,7 +25,6 @@ from lidardesign.constraints.feasibility import check_feasible
 from lidardesign.constraints.origins import placement_notes
 from lidardesign.errors import BackgroundNote, DataError, InfeasibleError
 from lidardesign.fitting.request import BEST, COUNTS, KEY, FitRequest, FitResult, RunTarget, Weighting, check_several
-from lidardesign.fitting.trials import GoalSearch, HeldBackScenes, best_of, trials_of
 from lidardesign.formats.designs import relative_folder
 from lidardesign.mixture.fit import FitProblem, FittedSensors, fit_sensors
 from lidardesign.mixture.support import LEAST_SAMPLES, MOVED_SAMPLES, Retarget, at_condition, condition_text
@@ -44,6 +43,7 @@ from lidardesign.task import mount_of, random_generator
 from lidardesign.workers import Starmap
 
 if TYPE_CHECKING:
+    from lidardesign.fitting.trials import HeldBackScenes
     from lidardesign.rays.pool import CandidatePool
 
 # A larger share of scenes without information from a design is noted.
@@ -193,6 +193,9 @@ class Fitter:
     @cached_property
     def scenes(self) -> HeldBackScenes:
         """The scenes that all trials are scored on."""
+        # scoring loads compiled loops, which a given number of sensors does without
+        from lidardesign.fitting.trials import HeldBackScenes
+
         return HeldBackScenes(self.training)
 
     @cached_property
@@ -220,6 +223,8 @@ class Fitter:
 
     def _to_goal(self) -> FitResult:
         """The design with the least that keeps the goal, as its request gives it without a goal."""
+        from lidardesign.fitting.trials import GoalSearch
+
         request = self.request
         if request.sensors == BEST and request.least != "sensors":
             request = replace(request, sensors=self._best_count())
@@ -340,6 +345,8 @@ class Fitter:
 
     def _best_count(self) -> int:
         """The number of sensors that scores best on training scenes, with a note on those tried."""
+        from lidardesign.fitting.trials import best_of, trials_of
+
         request, metric = self.request, self.request.run.metric
         check_feasible(request.constraints, request.run.config.space, rays=request.rays)
         if not self.is_pooled:

@@ -13,7 +13,6 @@ from support.sensors import normal_sensor
 
 from lidardesign.api.run import open_run
 from lidardesign.errors import ConfigError, InfeasibleError
-from lidardesign.fitting import fit as fits
 from lidardesign.fitting import request as requests
 from lidardesign.fitting import trials as tried
 from lidardesign.fitting.request import BEST, CHOSEN_LEVEL, FitOptions, FitRequest
@@ -271,7 +270,7 @@ class TestTheCommand:
         def never(*_):
             raise AssertionError("numbers of sensors were tried")
 
-        monkeypatch.setattr(fits, "trials_of", never)
+        monkeypatch.setattr(tried, "trials_of", never)
         for options in (("--sensors", 1), ("--set", "sensors.count=1"), ("--layout", "spinning", "--channels", 1)):
             command = "constrain" if "--set" in options else "fit"
             done = lidardesign(command, flat, *options, "--rays", 4)
