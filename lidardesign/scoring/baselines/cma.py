@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -196,7 +196,8 @@ class MovableSensors:
         gate_m = np.stack([middle - half, middle + half], axis=1)
         varied = own[:, GATE].any(axis=1, keepdims=True)
         gate_m = np.where(varied, admitted_gates(gate_m, rows), rays.gate_m) if varied.any() else rays.gate_m
-        return Rays(rays.origin_m + own[:, ORIGIN], direction(azimuth, elevation), gate_m, sensor, rays.time_s)
+        looking = direction(azimuth, elevation)
+        return replace(rays, origin_m=rays.origin_m + own[:, ORIGIN], direction=looking, gate_m=gate_m, angles_rad=None)
 
     def excess(self, positions: RaysPerCondition) -> float:
         """The share by which the bandwidth of rays exceeds the design's; 0 where it does not."""
