@@ -40,6 +40,7 @@ from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import MOST_FILE_RAYS
 from lidardesign.sensors.pattern import Pattern, low_discrepancy
 from lidardesign.sensors.sensor import DEFAULT_LEVEL, interval_factor
+from lidardesign.simulate.calibration import reach_notes
 from lidardesign.space import angles, observed_point
 from lidardesign.task import Information, random_generator
 
@@ -122,6 +123,8 @@ def choose_parts(
     if len(chosen.members) < count:
         notes(f"{len(chosen.members)} of {count} parts: no further part tells more or fits the bounds")
     design = _design(name, constraints, [placed[member] for member in chosen.members], budget.rays)
+    for line in reach_notes(design):
+        notes(line)
     certificate = certificate_document(
         rays=design.count or 0,
         value=coverage.complete - chosen.value,

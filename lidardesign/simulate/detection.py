@@ -60,7 +60,13 @@ class Detections:
 
 
 def detect(
-    scene: Scene, frame: int, rays: Rays, windows_m: np.ndarray, echoes: Echoes, background: Background, physics: Physics
+    scene: Scene,
+    frame: int,
+    rays: Rays,
+    windows_m: np.ndarray,
+    echoes: Echoes,
+    background: Background,
+    physics: Physics,
 ) -> Detections:
     """Detect the returns of all rays of a frame; those of a sensor share its emitter's light.
 

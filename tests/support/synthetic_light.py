@@ -71,4 +71,6 @@ def counted(windows_m, echoes, light, detector, effects, seed: int = 0):
 
 
 def detected(windows_m, echoes, light, detector, effects, seed: int = 0):
-    return detect(SCENE, 0, one_sensor(windows_m), windows_m, echoes, light, Physics(detector, frozenset(effects), seed))
+    return detect(
+        SCENE, 0, one_sensor(windows_m), windows_m, echoes, light, Physics(detector, frozenset(effects), seed)
+    )

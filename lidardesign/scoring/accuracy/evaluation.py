@@ -131,7 +131,7 @@ def _rays(asked: EvaluationRequest, design: DesignSpec) -> tuple[int, RaysPerCon
         conditions = conditions_of(asked.task, asked.config, asked.space)
     each = len(conditions) * asked.test[0].frames
     count = max([one for one in counts if one * each <= RAYS_PER_SCENE], default=counts[0])
-    return count, tuple(design.rays(count, at=condition or None) for condition in conditions)
+    return count, tuple(asked.fired(design, count, condition) for condition in conditions)
 
 
 def _paired(values: np.ndarray, reference: np.ndarray) -> tuple[float, float]:

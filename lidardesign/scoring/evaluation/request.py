@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -16,6 +16,7 @@ from lidardesign.errors import ConfigError, PluginError
 from lidardesign.rays.training import TrainingScenes
 from lidardesign.registry import plugin_guard
 from lidardesign.samples import Samples
+from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Scene
 from lidardesign.scoring.baselines.cma import CmaSettings
 from lidardesign.scoring.baselines.simple import ALWAYS, BASELINES, check_baseline
@@ -23,6 +24,7 @@ from lidardesign.scoring.evaluation.mounting import MountError
 from lidardesign.scoring.scene_scores import RaysPerCondition, ScenePass
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design import DesignSpec
+from lidardesign.simulate.calibration import with_part_light
 from lidardesign.simulate.plan import EffectPlan, Planner
 from lidardesign.space import DesignSpace
 from lidardesign.task import Metric, Task, metric_of, mount_of
@@ -119,6 +121,10 @@ class EvaluationRequest:
             check_baseline(name, where="--baseline")
         if any(count < 1 for count in self.rays):
             raise ConfigError(f"{min(self.rays)} rays", where="--rays", allowed="1 or more")
+
+    def fired(self, design: DesignSpec, count: int, at: Mapping[str, float]) -> Rays:
+        """The rays of a design at condition values, with the light that the detector has in its parts."""
+        return with_part_light(design.rays(count, at=at or None), design, self.planner.detector)
 
     def scene_pass(
         self, fired: Callable[[int], Sequence[RaysPerCondition]], planner: Planner, plans: Sequence[EffectPlan] = ()

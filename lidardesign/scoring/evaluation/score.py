@@ -32,6 +32,7 @@ from lidardesign.scoring.scene_scores import RaysPerCondition, score_scenes, sil
 from lidardesign.scoring.statistics import FEWEST_RESAMPLED, mean_interval, paired_difference
 from lidardesign.sensors.compare import outside_notes
 from lidardesign.sensors.sensor import MOST_RAYS
+from lidardesign.simulate.calibration import light_notes
 from lidardesign.simulate.plan import EffectPlan, Planner
 from lidardesign.task import Metric, Score, notes_of
 
@@ -160,7 +161,7 @@ def _score_all(
 ) -> _Scored:
     """Score all entries in all scenes, here or by workers; `known` plans are not made again."""
     jobs = {entry.key: entry for entry in entries}
-    scene_pass = request.scene_pass(lambda number: [entry.rays_in(number) for entry in jobs.values()], planner, known)
+    scene_pass = request.scene_pass(lambda number: [entry.lit_in(number) for entry in jobs.values()], planner, known)
     scenes = score_scenes(scene_pass, progress, request.starmap)
     of_entries = zip(*(scene.scores for scene in scenes), strict=True)
     return _Scored(
@@ -237,7 +238,7 @@ def _notes(request: EvaluationRequest, entries: Sequence[Entry], matched: Sequen
     with plugin_guard(request.task.name):
         notes += notes_of(request.task, request.config, request.space)
     for design in request.designs:
-        notes += outside_notes(design, request.space)
+        notes += outside_notes(design, request.space) + light_notes(design, request.planner.detector)
     own = sorted((entry for entry in entries if not entry.baseline), key=lambda entry: entry.rays)
     shared = [entry for entry in own if entry.rays not in request.alone]
     # of each design the most rays, which come last

@@ -263,7 +263,7 @@ def find_corrected(  # noqa: ANN201
     dead,  # noqa: ANN001
     period,  # noqa: ANN001
 ):
-    """Find returns as `find_returns`, corrected for dead time, given pulses per ray, dead time and pulse period in bins."""
+    """Find returns as `find_returns`, corrected for dead time, given pulses of each ray, dead time, period in bins."""
     found = np.full(len(offset) - 1, np.nan)
     longest = 0
     for i in range(len(offset) - 1):

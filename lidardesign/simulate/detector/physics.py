@@ -74,7 +74,9 @@ class Photons:
 
     def emitted(self, sharing: np.ndarray) -> np.ndarray:
         """Emitted photons per ray and pulse where so many rays share an emitter, shape (N,) for (N,)."""
-        return self.pulse_energy_j / np.where(self.emission == "flood", np.maximum(sharing, 1), 1) / self.photon_energy_j
+        return (
+            self.pulse_energy_j / np.where(self.emission == "flood", np.maximum(sharing, 1), 1) / self.photon_energy_j
+        )
 
 
 @dataclass(frozen=True)
