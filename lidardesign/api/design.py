@@ -113,6 +113,8 @@ class Design(DesignSource):
         name: str | None = None,
         seed: int | None = None,
         certify: bool = False,
+        detector: Path | str | None = None,
+        settings: Sequence[str] | Mapping[str, Any] = (),
         workers: int | str = 1,
         notes: Notes = log_note,
         progress: Progress | None = None,
@@ -134,6 +136,8 @@ class Design(DesignSource):
             name: The design's name; "constrained" by default.
             seed: Seed of all random numbers; the run's by default.
             certify: Whether every number of rays gets a certificate, not the middle one alone.
+            detector: The detector that judges sets of parts and numbers of sensors: a name, or a YAML file.
+            settings: Settings of the task, to choose in scenes other than the learned ones.
             workers: Processes that look at training scenes, or the address of a dask scheduler, tcp://HOST:PORT.
             notes: Called with every note.
             progress: Called with every step, as "choosing 361 rays", and twice None.
@@ -158,6 +162,8 @@ class Design(DesignSource):
             name=name,
             seed=seed,
             certify=certify,
+            detector=detector,
+            settings=settings,
         )
         request = FitRequest.resolve(run, options, self.specification, notes=notes)
         return Design.fitted(request, workers=workers, notes=notes, progress=progress)

@@ -131,6 +131,8 @@ class Run(RunFolder):
         name: str | None = None,
         seed: int | None = None,
         certify: bool = False,
+        detector: Path | str | None = None,
+        settings: Sequence[str] | Mapping[str, Any] = (),
         workers: int | str = 1,
         notes: Notes = log_note,
         progress: Progress | None = None,
@@ -138,7 +140,7 @@ class Run(RunFolder):
         """Fit a design to the learned density; nothing is learned again, and nothing is saved yet.
 
         Arguments:
-            sensors: How many, or "best" (the default): as many as score best on training scenes.
+            sensors: How many, or "best" (the default): as many as score best on training scenes; of parts also "1-4".
             constraints: Constraints, a mapping of them, or a YAML file of them.
             rays: Rays per frame over all sensors.
             layout: chosen, even or spinning; by default chosen, where the task has a method `informs`.
@@ -152,6 +154,8 @@ class Run(RunFolder):
             name: The design's name.
             seed: Seed of all random numbers; the run's by default.
             certify: Whether every number of rays gets a certificate, not the middle one alone.
+            detector: The detector that judges sets of parts and numbers of sensors: a name, or a YAML file.
+            settings: Settings of the task, to choose in scenes other than the learned ones.
             workers: Processes that look at training scenes, or the address of a dask scheduler, tcp://HOST:PORT.
             notes: Called with every note; they are logged by default.
             progress: Called with every step, as "choosing 361 rays", and twice None.
@@ -176,6 +180,8 @@ class Run(RunFolder):
             name=name,
             seed=seed,
             certify=certify,
+            detector=detector,
+            settings=settings,
         )
         request = FitRequest.resolve(self, options, notes=notes)
         return Design.fitted(request, workers=workers, notes=notes, progress=progress)

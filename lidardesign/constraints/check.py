@@ -381,10 +381,10 @@ def _parts(document: Mapping[str, Any], parts: Mapping[str, Any] | None) -> list
         checks.append(ConstraintCheck(name, part.name, wrong or part.name, wrong is None))
     for own, rule in (parts.get("each") or {}).items():
         checks += _between(f"parts.each.{own}", sum(part.name == own for part in found), rule)
-    limit = parts.get("power_w")
-    if limit is not None:
-        power = sum(math.inf if part.value("power_w") is None else part.value("power_w") for part in found)
-        checks += _between("parts.power_w", power, {"max": limit})
+    for name, rule in (("power_w", {"max": parts.get("power_w")}), ("price", parts.get("price") or {})):
+        if rule.get("max") is not None:
+            total = sum(math.inf if part.value(name) is None else part.value(name) for part in found)
+            checks += _between(f"parts.{name}", total, rule)
     return checks
 
 

@@ -36,6 +36,8 @@ def fit(
     name: options.Name = "fit",
     seed: options.Seed = None,
     certify: options.Certify = False,
+    detector: options.Judge = None,
+    overrides: options.SceneSettings = None,
     workers: options.Workers = "1",
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -61,6 +63,8 @@ def fit(
             name=name,
             seed=seed,
             certify=certify,
+            detector=detector,
+            settings=overrides or (),
         )
         run_fit(FitRequest.resolve(RunFolder.open(run), chosen, notes=output.remark), output, workers)
 
@@ -107,7 +111,7 @@ def constrain(
         typer.Option(
             "--set",
             metavar="KEY=VALUE",
-            help="One constraint: gate.width_m.max=0.1; repeatable.",
+            help="One constraint: gate.width_m.max=0.1, or a key of the task as for `fit`; repeatable.",
             show_default=False,
             autocompletion=constraint_keys,
         ),
@@ -125,6 +129,7 @@ def constrain(
     name: options.Name = "constrained",
     seed: options.Seed = None,
     certify: options.Certify = False,
+    detector: options.Judge = None,
     workers: options.Workers = "1",
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -134,12 +139,15 @@ def constrain(
     with command(json=json, quiet=quiet, verbose=verbose) as output:
         with phase("libraries"):
             from lidardesign.constraints.document import Constraints
-            from lidardesign.fitting.request import FitOptions, FitRequest, load_constraints
+            from lidardesign.fitting.request import FitOptions, FitRequest, load_constraints, split_settings
             from lidardesign.formats.designs import need_run, open_target
 
+        opened, design = open_target(target, output.remark)
+        run = need_run(opened, target)
+        bounds, settings = split_settings(overrides or (), run.task)
         chosen = FitOptions(
             sensors=options.sensor_count(sensors),
-            constraints=load_constraints(constraints, overrides or (), output.remark) or Constraints(),
+            constraints=load_constraints(constraints, bounds, output.remark) or Constraints(),
             layout=layout,
             rays=rays,
             channels=channels,
@@ -152,6 +160,7 @@ def constrain(
             name=name,
             seed=seed,
             certify=certify,
+            detector=detector,
+            settings=settings,
         )
-        run, design = open_target(target, output.remark)
-        run_fit(FitRequest.resolve(need_run(run, target), chosen, design, notes=output.remark), output, workers)
+        run_fit(FitRequest.resolve(run, chosen, design, notes=output.remark), output, workers)
