@@ -24,7 +24,7 @@ from lidardesign.scenes.scene import Scene, group_numbers
 from lidardesign.scoring.scene_scores import score_lists
 from lidardesign.sensors.bandwidth import Bandwidth, mean_mbps
 from lidardesign.sensors.design import DesignSpec
-from lidardesign.simulate.plan import EffectPlan, Planner
+from lidardesign.simulate.plan import Decision, EffectPlan, Planner
 from lidardesign.simulate.returns import build_casters
 from lidardesign.task import Metric
 
@@ -85,7 +85,9 @@ class HeldBackScenes:
             casters, fired = build_casters(scene), [trial.fired for trial in missing]
             physics = None
             if self.planner is not None:
-                self.plan = self.plan or self.planner.plan(scene, [rays for one in fired for rays in one], casters)
+                if self.plan is None:
+                    plan = self.planner.plan(scene, [rays for one in fired for rays in one], casters)
+                    self.plan = replace(plan, decisions=tuple(map(_affordable, plan.decisions)))
                 physics = self.planner.physics(self.plan, self.training.seed)
             for trial, (score, _) in zip(
                 missing, score_lists(run.task, run.metric, scene, fired, casters, physics), strict=True
@@ -103,6 +105,11 @@ class HeldBackScenes:
             f"judged under {self.planner.detector.name} with {', '.join(sorted(self.plan.effects)) or 'no effects'}; "
             f"the skipped ones could change ranges by {1000 * range_m:.3g} mm and {lost:.2%} of the returns at most"
         ]
+
+
+def _affordable(decision: Decision) -> Decision:
+    """An effect that takes a thousand times as long as others is left out; the bound of what it changes is kept."""
+    return replace(decision, on=decision.on and decision.name != "multipath")
 
 
 def trials_of(request: FitRequest, fit: Callable[[FitRequest], DesignSpec], counts: Sequence[int]) -> list[Trial]:
