@@ -1,7 +1,7 @@
 """Sets of parts under a detector: what `fit --parts` chooses against the best of many other sets.
 
-The others are random, filled greedily from random starts, of one kind, and the best by the proxy with a member exchanged.
-The best of them is picked on half of the held-out scenes and compared on the other half. Effects are those of the
+The others are random, greedy from random starts, of one kind, and the best by the proxy with a member exchanged. The
+best of them is picked on half of the held-out scenes and compared on the other half. Effects are those of the
 choice: all that matter but multipath.
 
     python benchmarks/part_sets.py --run RUN [--parts NAME,NAME] [--count N] [--klux 0 100] [--others 30] [--scenes 100]
