@@ -136,11 +136,19 @@ class Origin(_Keys):
         return self
 
 
+class RollRange(_Keys):
+    """Bounds on a roll about the boresight, which further rolls equal with the two fields exchanged [degrees]."""
+
+    min: Annotated[float, Field(ge=-45, le=45)] | None = None
+    max: Annotated[float, Field(ge=-45, le=45)] | None = None
+
+
 class Boresight(_Keys):
-    """Bounds on the boresight of a sensor [degrees]."""
+    """Bounds on the boresight of a sensor and its roll [degrees]."""
 
     azimuth_deg: AngleRange = AngleRange()
     elevation_deg: ElevationRange = ElevationRange()
+    roll_deg: RollRange = RollRange()
 
 
 class FieldOfView(_Keys):

@@ -29,7 +29,7 @@ from lidardesign.fitting.request import FitRequest, FitResult
 from lidardesign.fitting.trials import HeldBackScenes, Trial, best_of
 from lidardesign.mixture.bounds import bounds_of, clip_azimuth
 from lidardesign.mixture.components import Axes
-from lidardesign.numerics import TINY
+from lidardesign.numerics import SLACK, TINY
 from lidardesign.parts.catalogue import named_parts, part_rays, part_sensor
 from lidardesign.parts.part import Part
 from lidardesign.rays import information
@@ -45,7 +45,7 @@ from lidardesign.sensors.bandwidth import split_budget
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import MOST_FILE_RAYS
 from lidardesign.sensors.pattern import Pattern, low_discrepancy
-from lidardesign.sensors.sensor import DEFAULT_LEVEL, interval_factor
+from lidardesign.sensors.sensor import DEFAULT_LEVEL, Sensor, interval_factor
 from lidardesign.simulate.calibration import reach_notes, with_part_light
 from lidardesign.simulate.detector.physics import IDEAL, Detector, check_windows
 from lidardesign.space import angles, observed_point
@@ -373,8 +373,19 @@ def proposed(parts: Sequence[Part], constraints: Constraints, samples: Samples, 
             for turn, shape in enumerate(ways):
                 # each way to mount a part has the middle, and its share of the others
                 for aim in (aims[0], *aims[1 + turn :: len(ways)]):
-                    placed.append(PlacedPart(shape, shape.pose(origin, *aim, 0.0, axes), number))
+                    pose = shape.pose(origin, *aim, np.clip(0.0, bounds.roll_low[0], bounds.roll_high[0]), axes)
+                    if _may_roll(part_sensor(shape.part, pose), rules):
+                        placed.append(PlacedPart(shape, pose, number))
+    if not placed:
+        raise InfeasibleError("no part can be mounted at the roll", conflicts=["boresight.roll_deg", "parts"])
     return placed
+
+
+def _may_roll(sensor: Sensor, rules: SensorRules) -> bool:
+    """True where a sensor keeps the bounds on its roll."""
+    low, high = rules.boresight.roll_deg.min, rules.boresight.roll_deg.max
+    roll = np.degrees(sensor.roll_rad)
+    return (low is None or roll >= low - SLACK) and (high is None or roll <= high + SLACK)
 
 
 def _places(rules: SensorRules, samples: Samples, generator: np.random.Generator) -> np.ndarray:

@@ -78,6 +78,12 @@ class TestDesignsOfParts:
         away = np.mod(np.degrees([sensor.azimuth_rad for sensor in spec.sensors]) - bound, 360)
         assert (away <= 20 + 1e-6).all()
 
+    def test_are_upright_where_they_may_not_roll(self, run):
+        spec = bought(run, sensors=3, boresight={"roll_deg": {"min": 0, "max": 0}})
+        assert [sensor.roll_rad for sensor in spec.sensors] == pytest.approx([0.0] * len(spec.sensors))
+        with pytest.raises(InfeasibleError, match="plane"):
+            bought(run, boresight={"roll_deg": {"min": 5}})
+
     def test_keep_a_bandwidth_and_a_number_of_rays(self, run):
         spec = bought(run, budget={"rays": 30, "bandwidth_mbps": 10.0})
         assert spec.count == 30
