@@ -25,6 +25,8 @@ from lidardesign.rays.coverage import Coverage
 
 FEW_SETS = 100_000  # are searched through, whatever it takes
 MOST_WORK = 1e9  # entries of the table that a search of more sets may read: some seconds
+STARTS = (8, 4, 2)  # a set is begun at the last candidate of the best eighth of its kind, ...
+MOST_KINDS = 6  # that further sets are sought of, those that tell most by themselves
 MOST_LEAVING = 2  # members of a set that are exchanged at once
 
 
@@ -104,7 +106,7 @@ def choose_set(coverage: Coverage, limits: SetLimits) -> ChosenSet:
 def further_sets(coverage: Coverage, limits: SetLimits, chosen: Sequence[int], most: int) -> list[tuple[int, ...]]:
     """A set and the best others of each way to fill one greedily, distinct, those of one kind first.
 
-    The ways: one kind alone, a kind in the place of a member's, and from the best candidate of each kind of kinds.
+    The ways: one kind alone, a kind in the place of a member's, and from several candidates of each kind and place.
 
     Arguments:
         coverage: The information of each candidate.
@@ -114,7 +116,10 @@ def further_sets(coverage: Coverage, limits: SetLimits, chosen: Sequence[int], m
     """
     (kind, allowed), *others = limits.kinds
     single = np.where(limits.may_join((), len(kind)), coverage.gains(np.zeros(len(coverage.weight)))[:, 0], 0.0)
-    present = [one for one in range(len(allowed)) if single[kind == one].max(initial=0.0) > 0]
+    order = np.argsort(-single, kind="stable")
+    order = order[single[order] > 0]
+    _, first = np.unique(kind[order], return_index=True)
+    present = kind[order[np.sort(first)]][:MOST_KINDS]
 
     def filled(counts: np.ndarray) -> tuple[int, ...]:
         own = SetLimits(limits.count, [(kind, np.minimum(counts, allowed)), *others], limits.budgets)
@@ -128,12 +133,9 @@ def further_sets(coverage: Coverage, limits: SetLimits, chosen: Sequence[int], m
         for out, into in swaps
         if out != into
     ]
-    firsts = [
-        int(rows[single[rows].argmax()])
-        for own, _ in limits.kinds
-        for rows in map(np.flatnonzero, own == np.arange(own.max() + 1)[:, None])
-        if len(rows) and single[rows].max() > 0
-    ]
+    of_kinds = [order[kind[order] == one] for one in present]
+    firsts = [int(rows[len(rows) // part]) for rows in of_kinds for part in (len(rows) + 1, *STARTS)]
+    firsts += [int(order[first]) for own, _ in others for first in np.unique(own[order], return_index=True)[1]]
     started = [_filled(coverage, limits, (first,)) for first in firsts]
     found = {tuple(sorted(chosen)): tuple(chosen)}
     for group, room in ((alone, (most + 1) // 2), (exchanged + started, most)):
