@@ -12,6 +12,7 @@ The meaning of the bounds, here and in `check`, which verifies them on the finis
   the intervals keep to that box too (see `origins`);
 - `boresight.azimuth_deg` is an interval on the circle: with `min` above `max` it passes through 0;
 - `parts` names real parts that the design is made of, whose fields of view and gates then keep these bounds;
+- `survive: 1` chooses rays for the loss of any one sensor, too;
 - every gate stays inside the range bounds of the design space, whatever the file says.
 
 Entries of `each` apply to the first, second, ... sensor over the common keys.
@@ -268,6 +269,7 @@ class Constraints(SensorConstraints):
     sensors: SensorCount = SensorCount()
     budget: Budget = Budget()
     parts: Parts | None = None
+    survive: Literal[0, 1] = 0
     each: list[SensorConstraints] = []
 
     @classmethod
@@ -301,6 +303,11 @@ class Constraints(SensorConstraints):
                 raise ConfigError(f"{name} has no value", where=locate(path), allowed="a value", hint=UNSET_HINT)
         return check_model(cls, values, locate)
 
+    @property
+    def least_sensors(self) -> int:
+        """The least number of sensors."""
+        return max(self.sensors.min or 1, len(self.each), 1 + self.survive)
+
     @cached_property
     def rules(self) -> tuple[SensorRules, ...]:
         """The rules of the sensor of each entry of `each`, and last those of every further sensor."""
@@ -315,7 +322,7 @@ class Constraints(SensorConstraints):
 
     def as_document(self) -> dict[str, Any]:
         """The plain values that were given, for the design file."""
-        return self.model_dump(exclude_none=True, exclude_unset=True)
+        return self.model_dump(exclude_none=True, exclude_unset=True, exclude=None if self.survive else {"survive"})
 
 
 def merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:

@@ -2,7 +2,8 @@
 
 Where the number of sensors is open, designs of several numbers are fitted at the middle number of rays and scored on
 training scenes that were held back, each in the bandwidth that it takes. The fewest sensors within a standard error of
-the best are taken, where bandwidth has the price that it has for rays.
+the best are taken, where bandwidth has the price that it has for rays. For a goal the least that keeps it is found in
+the same way, and fitted again as if it had been asked for.
 
 A design's twin is fitted to the density without its occlusion term, without learning again: the baseline
 `no-visibility`.
@@ -23,8 +24,18 @@ from lidardesign.constraints.document import Constraints, merged
 from lidardesign.constraints.feasibility import check_feasible
 from lidardesign.constraints.origins import placement_notes
 from lidardesign.errors import BackgroundNote, DataError, InfeasibleError
-from lidardesign.fitting.request import BEST, COUNTS, KEY, WORLD, FitRequest, FitResult, RunTarget, Weighting
-from lidardesign.fitting.trials import HeldBackScenes, best_of, trials_of
+from lidardesign.fitting.request import (
+    BEST,
+    COUNTS,
+    KEY,
+    WORLD,
+    FitRequest,
+    FitResult,
+    RunTarget,
+    Weighting,
+    check_several,
+)
+from lidardesign.fitting.trials import GoalSearch, HeldBackScenes, best_of, trials_of
 from lidardesign.formats.designs import relative_folder
 from lidardesign.mixture.fit import FitProblem, FittedSensors, fit_sensors
 from lidardesign.mixture.support import LEAST_SAMPLES, MOVED_SAMPLES, Retarget, at_condition, condition_text
@@ -47,6 +58,8 @@ if TYPE_CHECKING:
 
 # A larger share of scenes without information from a design is noted.
 MOST_SILENT = 0.5
+# So much of what sensors see is seen by several, or a note says so where a sensor may fail.
+LEAST_SHARED = 0.9
 # As many samples as the standard preset of `learn` leaves.
 TWIN_SAMPLES = 100_000
 TWIN_NAME = "no-visibility"
@@ -82,6 +95,8 @@ def fit_design(
     result = fitter.fit()
     for note in result.notes:
         notes(note)
+    # of a goal it is found
+    request = fitter.request
     run, design = request.run, result.design
     if len(request.names) == len(design.sensors):
         named = (replace(sensor, name=name) for sensor, name in zip(design.sensors, request.names, strict=True))
@@ -188,6 +203,11 @@ class Fitter:
         return moved
 
     @cached_property
+    def scenes(self) -> HeldBackScenes:
+        """The scenes that all trials are scored on."""
+        return HeldBackScenes(self.training, self.request.planner)
+
+    @cached_property
     def pool(self) -> CandidatePool | None:
         """The pool of candidate rays at the sensors' place; None where their origins are free."""
         if not self.is_pooled:
@@ -200,18 +220,41 @@ class Fitter:
     def fit(self) -> FitResult:
         """The design of the request."""
         request = self.request
+        if request.goal is not None:
+            return self._to_goal()
         if request.constraints.parts is not None:
-            return self._parts()
+            return self._parts(request, self.notes)
         if request.layout == "spinning":
             return self._rings()
         if request.sensors == BEST:
             return self._without_idle(self._best_count())
         return self._fitted(request)
 
+    def _to_goal(self) -> FitResult:
+        """The design with the least that keeps the goal, as its request gives it without a goal."""
+        request = self.request
+        if request.sensors == BEST and request.least != "sensors":
+            request = replace(request, sensors=self._best_count())
+
+        def fit(asked: FitRequest) -> DesignSpec:
+            limit = asked.constraints.budget.bandwidth_mbps
+            named = {"sensors": asked.sensors, "rays": asked.rays, "Mbit/s": limit and f"{limit:g}"}
+            self.progress(f"trying {', '.join(f'{value} {name}' for name, value in named.items() if value)}")
+            if asked.constraints.parts is not None:
+                return self._parts(asked, ignore).design
+            return self._fitted(asked, certifies=False).design
+
+        with phase("trials"):
+            search = GoalSearch(request, fit, self.scenes)
+            found = search.found(COUNTS)
+        self.request = replace(found.request, goal=None)
+        for note in search.notes(found):
+            self.notes(note)
+        return replace(self.fit(), goal=search.as_dict(found))
+
     def _without_idle(self, count: int) -> FitResult:
         """The design of at most `count` sensors, fewer while any would fire no ray or rest on too few samples."""
-        bounds = self.request.constraints
-        least = max(bounds.sensors.min or 1, len(bounds.each))
+        least = self.request.constraints.least_sensors
         while count > least:
             try:
                 result = self._fitted(replace(self.request, sensors=count), may_idle=True)
@@ -248,17 +291,22 @@ class Fitter:
             )
         )
 
-    def _fitted(self, request: FitRequest, *, is_trial: bool = False, may_idle: bool = False) -> FitResult:
+    def _fitted(
+        self, request: FitRequest, *, is_trial: bool = False, may_idle: bool = False, certifies: bool = True
+    ) -> FitResult:
         """The design of a request whose number of sensors is known.
 
         Arguments:
             request: What is asked for.
             is_trial: Whether its number of sensors is being tried.
             may_idle: Whether sensors may be left without a ray.
+            certifies: Whether chosen rays get their certificates, which no ray depends on.
         """
         started, constraints, counts = time.perf_counter(), request.constraints, request.counts
         is_chosen = request.layout == "chosen"
         fitted = self._sensors(request, constraints, counts[-1] if is_chosen else request.rays)
+        if constraints.survive:
+            check_several(len(fitted.sensors))
         design = DesignSpec(
             name=request.name,
             sensors=fitted.sensors,
@@ -281,7 +329,7 @@ class Fitter:
                 level=request.level,
                 gates=request.gates,
                 pool=self.pool,
-                certified=() if is_trial else counts if request.certify else (middle,),
+                certified=() if is_trial or not certifies else counts if request.certify else (middle,),
                 each_fires=not may_idle,
                 is_trial=is_trial,
                 progress=ignore if is_trial else self.progress,
@@ -291,6 +339,11 @@ class Fitter:
                 notes.append(
                     f"about {chosen.silent:.0%} of the training scenes that were held back, no ray tells anything; "
                     "where that is not expected, check that places, directions and gates are right, and in metres"
+                )
+            if chosen.shared < LEAST_SHARED:
+                notes.append(
+                    f"constraints let several sensors see {chosen.shared:.0%} of what they see together: the rest is "
+                    "lost with its sensor; allow wider fields of view or gates"
                 )
         elif fitted.rays is not None:
             design = replace(design, constraints=merged(design.constraints, {"budget": {"rays": fitted.rays}}))
@@ -309,22 +362,21 @@ class Fitter:
             self.progress(f"trying --sensors {trial.sensors}")
             return self._fitted(trial, is_trial=True, may_idle=True).design
 
-        scenes = HeldBackScenes(self.training, request.planner)
         with phase("trials"):
             trials = trials_of(request, fit, COUNTS)
-            best = best_of(trials, scenes, metric)
+            best = best_of(trials, self.scenes, metric)
         found = ", ".join(f"{one.sensors}: {one.scores.mean():.4g} in {one.mbps:.3g} Mbit/s" for one in trials)
         text = f"sensors: {best.sensors}; {metric.name} [{metric.unit}] on {len(best.scores)} training scenes "
         self.notes(BackgroundNote(f"{text}by their number: {found}"))
-        for line in scenes.effects:
+        for line in self.scenes.effects:
             self.notes(BackgroundNote(line))
         return best.sensors
 
-    def _parts(self) -> FitResult:
+    def _parts(self, request: FitRequest, notes: Notes) -> FitResult:
         from lidardesign.fitting.part_design import choose_parts
 
-        informs = partial(checked_information, self.request.run.task)
-        return choose_parts(self.samples, self.request, self.training, informs, self.notes, self.progress)
+        informs = partial(checked_information, request.run.task)
+        return choose_parts(self.samples, request, self.training, informs, notes, self.progress)
 
     def _rings(self) -> FitResult:
         from lidardesign.fitting.spinning import CHANNELS, choose_rings
@@ -387,6 +439,8 @@ def twin_without_visibility(
     seed = seed if isinstance(seed, int) else 0
     drawn = twin_samples(run) if samples is None else samples()
     document = {key: value for key, value in design.constraints.items() if key != "parts"}
+    if rays == 1:
+        document.pop("survive", None)
     # a bandwidth is one of evaluations, whatever bits the design was made for
     budget = document.get("budget", {}) if bandwidth_mbps is None else {"bandwidth_mbps": bandwidth_mbps}
     document["budget"] = {**budget, "rays": rays}

@@ -6,10 +6,12 @@ the run's samples and its target density.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -33,16 +35,16 @@ from lidardesign.samples import Samples
 from lidardesign.sensors.design import FITTED_LAYOUTS, DesignSpec, Gates, LayoutName
 from lidardesign.sensors.pattern import TRAVELLED
 from lidardesign.sensors.sensor import LEVELS, MOST_RAYS
-from lidardesign.simulate.detector.files import load_detector
-from lidardesign.simulate.plan import Planner
 from lidardesign.space import DIMENSIONS, DesignSpace
 from lidardesign.task import Task
 
 if TYPE_CHECKING:
     from lidardesign.density.objective.target import Target
+    from lidardesign.simulate.plan import Planner
 
 BEST = "best"  # as many sensors as score best on training scenes
 COUNTS = (1, 2, 3, 4, 6, 8)  # of sensors, that are tried for that
+LEAST = ("bandwidth", "rays", "sensors", "parts")  # of what a design for a goal has as little as it can
 CHOSEN_LEVEL = 0.999  # rays are chosen inside fields and gates: narrower ones would only leave candidates out
 # Of designs: names that a file may have everywhere.
 NAME_PATTERN = re.compile(r"[^\W.][\w.+-]{0,99}")
@@ -76,9 +78,12 @@ class FitOptions:
         certify: Whether every number of rays gets a certificate, not the middle one alone.
         detector: The detector under which designs that are tried are judged: a name, or its file; ideal by default.
         settings: Settings of the task for the scenes that designs are chosen and judged in.
+        survive: 1: rays are chosen for the loss of any one sensor, too; by default as constraints say.
+        goal: The score that the design has to keep on training scenes that were held back, in the metric's unit.
+        least: What it then has the least of: bandwidth, rays, sensors or parts.
 
     Raises:
-        ConfigError: An invalid name, layout or choice of gates.
+        ConfigError: An invalid name, layout, choice of gates or of what is least.
     """
 
     sensors: int | str | None = None
@@ -97,6 +102,9 @@ class FitOptions:
     certify: bool = False
     detector: Path | str | None = None
     settings: Sequence[str] | Mapping[str, Any] = ()
+    survive: int | None = None
+    goal: float | None = None
+    least: str | None = None
 
     def __post_init__(self) -> None:
         if self.name is not None and not NAME_PATTERN.fullmatch(self.name):
@@ -106,10 +114,13 @@ class FitOptions:
             check_choice(self.layout, "--layout", FITTED_LAYOUTS)
         if self.gates is not None:
             check_choice(self.gates, "--gates", get_args(Gates))
+        if self.least is not None:
+            check_choice(self.least, "--least", LEAST)
         if self.sensors not in (None, BEST, *range(1, MOST_FITTED + 1)) and not self.numbers:
             allowed = f"a whole number from 1 to {MOST_FITTED}, best, or with parts numbers such as 1-4"
             raise ConfigError(repr(self.sensors), where="--sensors", allowed=allowed)
         limits = {"rays": (1, MOST_RAYS), "channels": (1, MOST_FITTED), "seed": (0, MAX_SEED)}
+        limits["survive"] = (0, 1)
         for name, (low, high) in limits.items():
             if getattr(self, name) is not None:
                 check_number(getattr(self, name), f"--{name}", low, high, whole=True)
@@ -147,6 +158,8 @@ class FitRequest:
         certify: Whether every number of rays gets a certificate.
         detector: The detector under which designs are judged, by name or file; None: they are in an ideal world.
         settings: Settings of the task for the scenes that designs are chosen and judged in.
+        goal: The score that it has to keep, with the least of `least`; None leaves nothing to be sought.
+        least: One of `LEAST`.
     """
 
     run: RunFolder
@@ -167,6 +180,8 @@ class FitRequest:
     detector: str | None = None
     settings: tuple[str, ...] = ()
     fewest: int | None = None
+    goal: float | None = None
+    least: str = LEAST[0]
 
     @classmethod
     def resolve(
@@ -195,20 +210,24 @@ class FitRequest:
         asked = load_constraints(options.constraints, notes=notes)
         if asked is None and base is not None:
             asked = Constraints()
-        constraints, names = _with_rig(options, _with_parts(options, asked, run), run, notes)
+        constraints, names = _with_rig(options, _with_survival(options, _with_parts(options, asked, run)), run, notes)
         rules, moved = snap_to_space(constraints or Constraints(), run.config.space)
         for note in moved:
             notes(note)
         layout = _layout(rules, base, run, options)
         _check_layout(layout, rules, run, options)
+        if options.numbers and (rules.parts is None or options.goal is not None):
+            fault = "together with a goal" if rules.parts else "without parts"
+            raise ConfigError(f"several numbers of sensors {fault}", where="--sensors", allowed=f"N, or {BEST}")
+        sensors = _sensors(options.numbers[-1] if options.numbers else options.sensors, rules, base, layout)
+        most = sensors if isinstance(sensors, int) else rules.sensors.max or math.inf
+        if rules.survive:
+            check_several(most)
+        _check_goal(layout, rules, run, options)
         at = {**(base.at if base else {}), **options.at}
         space = run.config.space.at(at)
         if layout != "spinning" and rules.parts is None:
             _check_conditions(rules, space)
-        if options.numbers and rules.parts is None:
-            raise ConfigError("several numbers of sensors without parts", where="--sensors", allowed=f"N, or {BEST}")
-        most = options.numbers[-1] if options.numbers else options.sensors
-        asked_sensors = _sensors(most, rules, base, layout)
         weighting = _weighting(settings_texts(options.weights), base)
         if weighting.settings:
             with_task_settings(run.task, run.config, weighting.settings, option=weighting.origin)
@@ -216,8 +235,11 @@ class FitRequest:
         if settings:
             with_task_settings(run.task, run.config, settings)
         if detector is not None:
+            # it loads what simulates light, which fits in an ideal world do without
+            from lidardesign.simulate.detector.files import load_detector
+
             load_detector(detector)
-            if rules.parts is None and (layout == "spinning" or asked_sensors != BEST):
+            if rules.parts is None and (layout == "spinning" or (sensors != BEST and options.goal is None)):
                 notes(f"{detector} judges sets of parts and numbers of sensors, and none are tried here")
         channels = options.channels
         if layout == "spinning" and channels is None and base is not None:
@@ -229,7 +251,7 @@ class FitRequest:
             constraints=rules,
             is_constrained=constraints is not None,
             at=at,
-            sensors=asked_sensors,
+            sensors=sensors,
             layout=layout,
             rays=_rays(options.rays, rules, base),
             gates=_gates(options.gates, base, space, layout),
@@ -241,6 +263,8 @@ class FitRequest:
             detector=detector,
             settings=settings,
             fewest=None if options.numbers is None else options.numbers[0],
+            goal=options.goal,
+            least=options.least or ("bandwidth" if rules.parts is None else "parts"),
         )
 
     @property
@@ -248,6 +272,9 @@ class FitRequest:
         """The detector, and the effects that matter to the metric; None without a detector."""
         if self.detector is None:
             return None
+        from lidardesign.simulate.detector.files import load_detector
+        from lidardesign.simulate.plan import Planner
+
         planner = Planner(load_detector(self.detector))
         return replace(planner, tolerance=planner.tolerated.within(self.run.metric))
 
@@ -327,12 +354,16 @@ def _check_layout(layout: LayoutName, constraints: Constraints, run: RunFolder, 
             allowed="tasks with informs",
             hint="--layout even, or give the task a method informs(scene, returns)",
         )
+    place = f"the layout {layout}" if constraints.parts is None else "a design of real parts"
     faults = {
         (f"{options.channels} channels in the layout {layout}", "--channels", "--layout spinning"): (
             options.channels is not None and layout != "spinning"
         ),
         (f"a gate per ray in the layout {layout}", "--gates", "--layout chosen"): (
             options.gates == "ray" and layout != "chosen" and constraints.parts is None
+        ),
+        (f"sensors that may fail in {place}", "survive", "--layout chosen, without parts"): (
+            bool(constraints.survive) and place != "the layout chosen"
         ),
         ("spinning sensors with --at or --weight", "--layout", "chosen, even"): (
             layout == "spinning" and (bool(options.at) or bool(options.weights))
@@ -344,6 +375,37 @@ def _check_layout(layout: LayoutName, constraints: Constraints, run: RunFolder, 
     for (fault, where, allowed), is_found in faults.items():
         if is_found:
             raise ConfigError(fault, where=where, allowed=allowed)
+
+
+def _check_goal(layout: LayoutName, constraints: Constraints, run: RunFolder, options: FitOptions) -> None:
+    """Refuse a goal that no score can be held against, and what cannot be sought for one.
+
+    Raises:
+        ConfigError: There is one.
+    """
+    goal, least, metric, are_parts = options.goal, options.least, run.metric, constraints.parts is not None
+    faults = {
+        ("no goal", "--least", "--goal SCORE --least WHAT"): goal is None and least is not None,
+        ("a goal for sensors that spin", "--goal", "the layouts chosen and even"): (
+            goal is not None and layout == "spinning"
+        ),
+        (f"{least} of a design of parts", "--least", "parts"): are_parts and least not in (None, "parts"),
+        ("no parts are named", "--least parts", "--parts NAME,NAME"): not are_parts and least == "parts",
+        (f"{options.sensors} sensors, of which the least are sought", "--sensors", "sensors.max, or nothing"): (
+            least == "sensors" and isinstance(options.sensors, int)
+        ),
+    }
+    for (fault, where, allowed), is_found in faults.items():
+        if is_found:
+            raise ConfigError(fault, where=where, allowed=allowed)
+    if goal is not None:
+        low, high = (0.0 if metric.worst > 0 else -math.inf), metric.worst
+        if metric.better == "higher":
+            low, high = metric.worst, 100.0 if metric.unit == "%" else math.inf
+        is_number = isinstance(goal, Real) and not isinstance(goal, bool)
+        if not (is_number and math.isfinite(goal) and low <= goal <= high):
+            allowed = f"a number from {low:g} to {high:g} {metric.unit}"
+            raise ConfigError(f"{goal!r} as {metric.name}", where="--goal", allowed=allowed)
 
 
 def _check_conditions(constraints: Constraints, space: DesignSpace) -> None:
@@ -414,6 +476,26 @@ def _with_parts(options: FitOptions, asked: Constraints | None, run: RunFolder) 
                 fault, where="--parts", allowed="--parts NAME,NAME --sensors N, or parts.names, parts.count"
             )
     return asked
+
+
+def _with_survival(options: FitOptions, asked: Constraints | None) -> Constraints | None:
+    """The constraints with the user's word on sensors that may fail."""
+    if options.survive is None or (asked is None and not options.survive):
+        return asked
+    document = {} if asked is None else asked.as_document()
+    return Constraints.from_mapping({**document, "survive": options.survive})
+
+
+def check_several(sensors: float) -> None:
+    """Refuse a single sensor that may fail.
+
+    Raises:
+        ConfigError: Fewer than two sensors.
+    """
+    if sensors < 2:
+        raise ConfigError(
+            "a single sensor that may fail", where="survive", allowed="2 sensors or more", hint="--sensors 2"
+        )
 
 
 def _sensors(
@@ -531,6 +613,7 @@ class FitResult:
         notes: Lines on sensors.
         numbers: By number of parts, where several were asked for: their names, score, power and price.
         error_estimates: Standard errors of log_likelihood, ess and admissible_mass.
+        goal: For a goal, what was tried, as plain values.
     """
 
     design: DesignSpec
@@ -542,6 +625,7 @@ class FitResult:
     notes: tuple[str, ...] = ()
     numbers: tuple[Mapping[str, Any], ...] = ()
     error_estimates: Mapping[str, Estimate] = field(default_factory=dict)
+    goal: Mapping[str, Any] | None = None
 
     @classmethod
     def of_fit(cls, design: DesignSpec, fitted: FittedSensors, samples: Samples, seconds: float) -> FitResult:
@@ -574,6 +658,7 @@ class FitResult:
             "seconds": self.seconds,
             "error_estimates": as_documents(self.error_estimates),
             **({"numbers": [dict(row) for row in self.numbers]} if self.numbers else {}),
+            **({} if self.goal is None else {"goal": dict(self.goal)}),
         }
 
 

@@ -1,6 +1,7 @@
 """Designs tried on training scenes that nothing was fitted to or chosen on, and scored there by the task's metric.
 
-The scenes are doubled until what is decided is clear, or as many have judged as a choice of rays may take.
+The scenes are doubled until what is decided is clear, or as many have judged as a choice of rays may take. So the best
+number of sensors is found, and the least that keeps a goal.
 """
 
 from __future__ import annotations
@@ -9,19 +10,20 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
-from lidardesign.constraints.document import Constraints
-from lidardesign.errors import InfeasibleError
+from lidardesign.constraints.document import Constraints, merged
+from lidardesign.errors import BackgroundNote, InfeasibleError
 from lidardesign.fitting.request import FitRequest
 from lidardesign.rays.information import FEW_SCENES, MOST_SCENES
 from lidardesign.rays.selection import SHARE_PER_BANDWIDTH
 from lidardesign.rays.training import HELD_BACK, TrainingScenes
-from lidardesign.run.clock import phase
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Scene, group_numbers
-from lidardesign.scoring.scene_scores import score_lists
+from lidardesign.scoring.scene_scores import score_lists, without_each
+from lidardesign.scoring.statistics import Interval, mean_interval
 from lidardesign.sensors.bandwidth import Bandwidth, mean_mbps
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.simulate.plan import Decision, EffectPlan, Planner
@@ -30,6 +32,8 @@ from lidardesign.task import Metric
 
 # Trials are compared to this share of the best score, or of its distance from the worst value, whichever is less.
 CLEAR_SHARE = 0.02
+# What is least for a goal is found to this share, and limits of bandwidth have so many digits, which a user can type.
+FINENESS, DIGITS = 0.03, 4
 
 
 @dataclass(eq=False)
@@ -39,17 +43,30 @@ class Trial:
     Arguments:
         sensors: Its number of sensors.
         fired: Its rays at each value of a condition.
+        survives: Whether the mean score over the loss of each sensor counts as much as that of all sensors.
         scores: Its score on each scene so far.
     """
 
     sensors: int
     fired: tuple[Rays, ...]
+    survives: bool = False
     scores: np.ndarray = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def lists(self) -> list[tuple[Rays, ...]]:
+        """What is scored: all its rays and, where losses count, those that are left by the loss of each sensor."""
+        return [self.fired, *(without_each(self.fired, self.sensors) if self.survives else [])]
 
     @property
     def mbps(self) -> float:
         """Its bandwidth by the read-out model of evaluations [Mbit/s]."""
         return mean_mbps(self.fired, Bandwidth())
+
+    def fires_as(self, other: Trial) -> bool:
+        """True where another design fires the same rays."""
+        names = ("origin_m", "direction", "gate_m", "sensor")
+        mine, its = ([getattr(rays, name) for rays in one.fired for name in names] for one in (self, other))
+        return all(map(np.array_equal, mine, its))
 
 
 class HeldBackScenes:
@@ -70,7 +87,6 @@ class HeldBackScenes:
         """The group of each scene so far."""
         return group_numbers(self.scenes)
 
-    @phase("trials")
     def score(self, trials: Sequence[Trial], count: int) -> None:
         """Score trials on the scenes up to `count` that each was not scored on yet."""
         run, known = self.training.run, len(self.scenes)
@@ -82,17 +98,17 @@ class HeldBackScenes:
         )
         for number in range(min(len(trial.scores) for trial in trials), count):
             scene, missing = self.scenes[number], [trial for trial in trials if len(trial.scores) <= number]
-            casters, fired = build_casters(scene), [trial.fired for trial in missing]
-            physics = None
+            casters, lists, physics = build_casters(scene), [trial.lists for trial in missing], None
             if self.planner is not None:
                 if self.plan is None:
-                    plan = self.planner.plan(scene, [rays for one in fired for rays in one], casters)
+                    plan = self.planner.plan(scene, [rays for trial in missing for rays in trial.fired], casters)
                     self.plan = replace(plan, decisions=tuple(map(_affordable, plan.decisions)))
                 physics = self.planner.physics(self.plan, self.training.seed)
-            for trial, (score, _) in zip(
-                missing, score_lists(run.task, run.metric, scene, fired, casters, physics), strict=True
-            ):
-                trial.scores = np.append(trial.scores, score.value)
+            jobs = list(itertools.chain(*lists))
+            found = iter(score_lists(run.task, run.metric, scene, jobs, casters, physics))
+            for trial, own in zip(missing, lists, strict=True):
+                values = [next(found)[0].value for _ in own]
+                trial.scores = np.append(trial.scores, (values[0] + np.mean(values[1:] or values)) / 2)
 
     @property
     def effects(self) -> list[str]:
@@ -133,6 +149,7 @@ def trials_of(request: FitRequest, fit: Callable[[FitRequest], DesignSpec], coun
             refused = refused or error
             continue
         trials.append(trial_of(request, design, rays))
+        trials[-1].survives = request.constraints.survive > 0
     if not trials and refused is not None:
         raise refused
     return trials
@@ -140,16 +157,21 @@ def trials_of(request: FitRequest, fit: Callable[[FitRequest], DesignSpec], coun
 
 def allowed_counts(constraints: Constraints, counts: Sequence[int]) -> list[int]:
     """Those of some numbers of sensors that constraints allow, or the least that they allow."""
-    low = max(constraints.sensors.min or 1, len(constraints.each))
-    high = constraints.sensors.max or math.inf
+    bounds = constraints.sensors
+    low, high = bounds.count or constraints.least_sensors, bounds.count or bounds.max or math.inf
     return [count for count in counts if low <= count <= high] or [low]
 
 
-def trial_of(request: FitRequest, design: DesignSpec, rays: int) -> Trial:
-    """A design with so many rays, wherever the request's sensors are."""
+def trial_of(request: FitRequest, design: DesignSpec, rays: int | None) -> Trial:
+    """A design with so many rays, or its own, wherever the request's sensors are."""
     run = request.run
     conditions = [{**request.at, **one} for one in run.conditions(run.config.space.at(request.at))]
-    return Trial(len(design.sensors), tuple(design.rays(rays, at=at or None) for at in conditions))
+    fired = tuple(design.rays(rays, at=at or None) for at in conditions)
+    if request.planner is not None:
+        from lidardesign.simulate.calibration import with_part_light
+
+        fired = tuple(with_part_light(one, design, request.planner.detector) for one in fired)
+    return Trial(len(design.sensors), fired)
 
 
 def best_of(
@@ -192,3 +214,209 @@ def _losses(
     lost = [np.bincount(groups, cost - least) / np.bincount(groups) for cost in costs]
     errors = [one.std(ddof=1) / math.sqrt(len(one)) if len(one) > 1 else 0.0 for one in lost]
     return np.array([one.mean() for one in lost]), np.array(errors), scale
+
+
+@dataclass(frozen=True, eq=False)
+class GoalTrial:
+    """A design that was tried for a goal.
+
+    Arguments:
+        request: The request that it is the design of.
+        cost: How much it has of what is to be least.
+        trial: The design, with its scores.
+        score: Their mean with its interval.
+        keeps: Whether the interval keeps the goal.
+    """
+
+    request: FitRequest
+    cost: float
+    trial: Trial
+    score: Interval
+    keeps: bool
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        return {
+            "sensors": self.trial.sensors,
+            "rays": len(self.trial.fired[0]),
+            "bandwidth_mbps": self.trial.mbps,
+            "limit_mbps": self.request.constraints.budget.bandwidth_mbps,
+            "value": self.score.mean,
+            "ci_low": self.score.low,
+            "ci_high": self.score.high,
+            "scenes": len(self.trial.scores),
+            "keeps": self.keeps,
+        }
+
+    def text(self, metric: Metric) -> str:
+        """What it is and scores, as `196 rays of 2 sensors in 0.52 Mbit/s: 5.8 mm (5.6 to 6)`."""
+        sensors = f"{self.trial.sensors} sensor{'s' * (self.trial.sensors > 1)}"
+        design = f"{len(self.trial.fired[0])} rays of {sensors} in {self.trial.mbps:.4g} Mbit/s"
+        ends = "" if self.score.low is None else f" ({self.score.low:.4g} to {self.score.high:.4g})"
+        return f"{design}: {self.score.mean:.4g} {metric.unit}{ends}"
+
+
+class GoalSearch:
+    """The search for the least of something that keeps a goal on training scenes that were held back.
+
+    A design keeps it where the 95 % interval of its mean score does. What is least is found to `FINENESS`.
+
+    Arguments:
+        request: What is asked for, with a goal; the number of sensors is known where it is not what is sought.
+        fit: Fits the design of a request.
+        scenes: The scenes, which all designs share.
+    """
+
+    def __init__(self, request: FitRequest, fit: Callable[[FitRequest], DesignSpec], scenes: HeldBackScenes) -> None:
+        self.request, self.metric, self.scenes, self._fit = request, request.run.metric, scenes, fit
+        budget = request.constraints.budget
+        self._model = Bandwidth(budget.bin_ps, budget.bits_per_bin, budget.rate_hz)
+        self.tried: list[GoalTrial] = []
+        self._refused: InfeasibleError | None = None
+
+    def found(self, counts: Sequence[int]) -> GoalTrial:
+        """The design with the least that keeps the goal, of these numbers of sensors where they are sought.
+
+        Raises:
+            InfeasibleError: None keeps it, or none can be fitted.
+        """
+        request, rays = self.request, self.request.counts
+        number = request.sensors if isinstance(request.sensors, int) else 1
+        if request.least == "sensors":
+            middle, numbers = self._with_rays(rays[len(rays) // 2]), allowed_counts(request.constraints, counts)
+            any(self._reached(replace(middle, sensors=number)) for number in numbers)
+        elif request.least == "parts":
+            any(self._reached(replace(request, sensors=fewer)) for fewer in range(1, number + 1))
+        elif request.least == "rays":
+            least_keeping(lambda many: self._reached(self._with_rays(int(many))), max(number - 1, 0.5), rays[-1], round)
+        else:
+            limit = math.inf
+            for number in sorted(rays, key=lambda number: number != rays[len(rays) // 2]):
+                limit = self._least_bandwidth(number, limit)
+        keeping = [one for one in self.tried if one.keeps]
+        if not keeping:
+            raise self._missed()
+        return min(keeping, key=lambda one: one.cost)
+
+    def notes(self, found: GoalTrial) -> list[str]:
+        """Lines on what was found, the next cheaper one, and all that was tried."""
+        metric = self.metric
+        text = f"goal {self.request.goal:g} {metric.unit}, least {self.request.least}: {found.text(metric)} on "
+        text += f"{len(found.trial.scores)} training scenes held back"
+        cheaper = [one for one in self.tried if one.cost < found.cost]
+        if cheaper:
+            text += f"; the next cheaper of those tried, {max(cheaper, key=lambda one: one.cost).text(metric)}"
+        tried = dict.fromkeys(one.text(metric) for one in self.tried)
+        return [text, BackgroundNote(f"tried: {'; '.join(tried)}")]
+
+    def as_dict(self, found: GoalTrial) -> dict[str, Any]:
+        """Plain values of the goal, of what was found and of all that was tried."""
+        return {
+            "value": self.request.goal,
+            "unit": self.metric.unit,
+            "least": self.request.least,
+            "found": found.as_dict(),
+            "tried": [one.as_dict() for one in self.tried],
+        }
+
+    def _fitted(self, request: FitRequest) -> Trial | None:
+        """The design of a request; None where there is none, and the first refusal is remembered."""
+        try:
+            return trial_of(request, self._fit(request), request.rays)
+        except InfeasibleError as error:
+            self._refused = self._refused or error
+            return None
+
+    def _reached(self, request: FitRequest) -> float | None:
+        """How much the design of a request has of what is to be least; None where it does not keep the goal."""
+        trial = self._fitted(request)
+        if trial is None:
+            return None
+        same = next((one for one in self.tried if one.trial.fires_as(trial)), None)
+        costs = {"bandwidth": self._mbps(trial), "rays": len(trial.fired[0])}
+        cost = costs.get(request.least, trial.sensors)
+        tried = replace(same, request=request) if same else GoalTrial(request, cost, trial, *self._judged(trial))
+        self.tried.append(tried)
+        return tried.cost if tried.keeps else None
+
+    def _judged(self, trial: Trial) -> tuple[Interval, bool]:
+        """The mean score of a design with its interval, and whether that keeps the goal."""
+        goal, count = self.request.goal or 0.0, FEW_SCENES
+        while True:
+            self.scenes.score([trial], count)
+            score = mean_interval(trial.scores, self.scenes.groups[:count], limits=self.metric.limits)
+            low, high = (score.mean if end is None else end for end in score[1:])
+            if not low <= goal <= high or 2 * count > MOST_SCENES:
+                return score, high <= goal if self.metric.better == "lower" else low >= goal
+            count *= 2
+
+    def _with_rays(self, rays: int) -> FitRequest:
+        """The request with a number of rays, whatever number its constraints name."""
+        bound = {} if self.request.constraints.budget.rays is None else {"rays": rays}
+        return _with_budget(replace(self.request, rays=rays), bound)
+
+    def _least_bandwidth(self, rays: int, limit: float) -> float:
+        """The least bandwidth below a limit in which so many rays keep the goal; the limit where there is none."""
+        request, low = self._with_rays(rays), self._model.mbps_of_widths(np.zeros(1), rays)
+        free = self._fitted(request) if low <= limit else None
+        if free is None:
+            return limit
+        high, bounded = rounded_up(min(limit, self._mbps(free))), replace(request, is_constrained=True)
+
+        def reached(mbps: float) -> float | None:
+            return self._reached(_with_budget(bounded, {"bandwidth_mbps": mbps}))
+
+        return least_keeping(reached, low, high, rounded_up) or limit
+
+    def _mbps(self, trial: Trial) -> float:
+        """The largest bandwidth of a design at any condition, by the model of its constraints [Mbit/s]."""
+        return max(map(self._model.mbps, trial.fired))
+
+    def _missed(self) -> InfeasibleError:
+        """The error where nothing keeps the goal, which says what is best, or why nothing can be fitted."""
+        if self._refused is not None and not self.tried:
+            return self._refused
+        metric, is_lower = self.metric, self.metric.better == "lower"
+        best = (min if is_lower else max)(self.tried, key=lambda one: one.score.mean)
+        end = best.score.high if is_lower else best.score.low
+        return InfeasibleError(
+            f"no design keeps {metric.name} {self.request.goal:g} {metric.unit} on training scenes held back; the best "
+            f"that was tried is {best.text(metric)}",
+            conflicts=["--goal"],
+            hint=f"--goal {best.score.mean if end is None else end:.4g}, more --rays, or fewer constraints",
+        )
+
+
+def least_keeping(
+    reached: Callable[[float], float | None], low: float, high: float, rounded: Callable[[float], float]
+) -> float | None:
+    """The least value, to `FINENESS`, that keeps a goal which all above it keep, by bisection of its logarithm.
+
+    Arguments:
+        reached: The value that a design has for which at most some value is asked; None where it misses the goal.
+        low: A value above 0 that is taken to miss it.
+        high: The largest value.
+        rounded: Rounds values to those that may be asked about.
+
+    Returns:
+        The value; None where `high` does not keep the goal.
+    """
+    least = reached(high)
+    while least is not None and least > (1 + FINENESS) * low:
+        middle = rounded(math.sqrt(low * least))
+        if not low < middle < least:
+            break
+        found = reached(middle)
+        low, least = (middle, least) if found is None else (low, found)
+    return least
+
+
+def rounded_up(mbps: float) -> float:
+    """A bandwidth rounded up to `DIGITS` digits [Mbit/s]."""
+    decimals = DIGITS - 1 - math.floor(math.log10(mbps))
+    return round(math.ceil(mbps * 10**decimals) / 10**decimals, max(decimals, 0))
+
+
+def _with_budget(request: FitRequest, budget: dict[str, float]) -> FitRequest:
+    document = merged(request.constraints.as_document(), {"budget": budget}) if budget else None
+    return request if document is None else replace(request, constraints=Constraints.from_mapping(document))

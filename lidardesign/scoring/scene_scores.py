@@ -108,6 +108,11 @@ def score_lists(
             yield score, time.perf_counter() - started + per_ray * _count(positions)
 
 
+def without_each(positions: RaysPerCondition, sensors: int) -> list[RaysPerCondition]:
+    """The rays that are left without each of a number of sensors, one after the other."""
+    return [tuple(rays.subset(np.flatnonzero(rays.sensor != lost)) for rays in positions) for lost in range(sensors)]
+
+
 def _count(positions: RaysPerCondition) -> int:
     return sum(len(rays) for rays in positions)
 

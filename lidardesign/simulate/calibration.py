@@ -172,9 +172,9 @@ class Reach:
     sunny_m: float | None = None
 
     def as_text(self) -> dict[str, str]:
-        """Cells of a table for people, by heading."""
-        ranges = {"in the dark": self.dark_m, f"at {FULL_SUN_KLUX:g} klux": self.sunny_m}
-        return {f"reaches {light} [m]": "unknown" if m is None else f"{m:.2g}" for light, m in ranges.items()}
+        """The cell of a table for people, by heading."""
+        ranges = ("unknown" if range_m is None else f"{range_m:.2g}" for range_m in (self.dark_m, self.sunny_m))
+        return {f"reaches in the dark / at {FULL_SUN_KLUX:g} klux [m]": " / ".join(ranges)}
 
 
 def reach_of(part: Part) -> Reach:

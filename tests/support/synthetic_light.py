@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Body, Scene, Sphere
 from lidardesign.simulate.detection import ArrivingLight, count_photons, detect
 from lidardesign.simulate.detector.light import Background, Echoes
 from lidardesign.simulate.detector.physics import Detector, Photons, Physics
+from support.rays import rays_along
 
 WAVELENGTH_M = 905e-9
 PULSES = 1000
@@ -56,10 +56,8 @@ def background(rays: int, per_metre: float = 0.0) -> Background:
     return Background(np.full(rays, float(per_metre)))
 
 
-def one_sensor(windows_m) -> Rays:
-    """Rays of one sensor with these windows, whose other properties do not matter."""
-    count = len(windows_m)
-    return Rays(np.zeros((count, 3)), np.tile([1.0, 0, 0], (count, 1)), windows_m, np.zeros(count), np.zeros(count))
+def one_sensor(windows_m):
+    return rays_along(np.tile([1.0, 0.0, 0.0], (len(windows_m), 1)), windows_m)
 
 
 def counted(windows_m, echoes, light, detector, effects, seed: int = 0):

@@ -38,6 +38,9 @@ def fit(
     certify: options.Certify = False,
     detector: options.Judge = None,
     overrides: options.SceneSettings = None,
+    survive: options.Survive = None,
+    goal: options.Goal = None,
+    least: options.Least = None,
     workers: options.Workers = "1",
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -65,6 +68,9 @@ def fit(
             certify=certify,
             detector=detector,
             settings=overrides or (),
+            survive=survive,
+            goal=goal,
+            least=least,
         )
         run_fit(FitRequest.resolve(RunFolder.open(run), chosen, notes=output.remark), output, workers)
 
@@ -130,6 +136,9 @@ def constrain(
     seed: options.Seed = None,
     certify: options.Certify = False,
     detector: options.Judge = None,
+    survive: options.Survive = None,
+    goal: options.Goal = None,
+    least: options.Least = None,
     workers: options.Workers = "1",
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -162,5 +171,8 @@ def constrain(
             certify=certify,
             detector=detector,
             settings=settings,
+            survive=survive,
+            goal=goal,
+            least=least,
         )
         run_fit(FitRequest.resolve(run, chosen, design, notes=output.remark), output, workers)

@@ -54,7 +54,6 @@ def show(
             from lidardesign.run_folder import RunFolder
             from lidardesign.sensors.compare import outside_notes, readout_of
             from lidardesign.sensors.design_file import design_document, pattern_document
-            from lidardesign.simulate.calibration import reach_notes, reaches_of
 
         condition = options.parse_at(at)
         run = None if space_of is None else RunFolder.open(space_of)
@@ -77,8 +76,13 @@ def show(
         for line in () if space is None else outside_notes(specification, space):
             output.remark(line)
         specification = shown[0]
-        for line in reach_notes(specification):
-            output.remark(line)
+        reaches = []
+        if any(sensor.part for sensor in specification.sensors):
+            from lidardesign.simulate.calibration import reach_notes, reaches_of
+
+            reaches = [vars(one) for one in reaches_of(specification)]
+            for line in reach_notes(specification):
+                output.remark(line)
         readout = readout_of(specification)
         document = {
             "design": str(design),
@@ -89,7 +93,7 @@ def show(
             "at": dict(specification.at),
             "frame": specification.mount or "world",
             "sensors": [sensor.as_dict() for sensor in specification.sensors],
-            "reaches": [vars(one) for one in reaches_of(specification)],
+            "reaches": reaches,
             "patterns": [pattern_document(pattern) for pattern in specification.patterns],
             "constraints": specification.constraints,
             "checks": [

@@ -208,6 +208,22 @@ Certify = Annotated[
         "--certify", help="Bound what any other choice could gain at every number of rays, not the middle one."
     ),
 ]
+Survive = Annotated[
+    int | None,
+    typer.Option("--survive", metavar="0|1", help="1: choose for the loss of any one sensor.", show_default="0"),
+]
+Losses = Annotated[bool, typer.Option("--losses", help="Also score designs with each of their sensors lost.")]
+Goal = Annotated[
+    float | None,
+    typer.Option("--goal", metavar="SCORE", help="Score to keep, by the least that it takes.", show_default=False),
+]
+LEAST = "bandwidth|rays|sensors|parts"
+Least = Annotated[
+    str | None,
+    typer.Option(
+        "--least", metavar=LEAST, help="What --goal takes least of; else bandwidth.", autocompletion=words(LEAST)
+    ),
+]
 Preset = Annotated[
     str | None,
     typer.Option(

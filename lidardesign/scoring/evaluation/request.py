@@ -42,7 +42,7 @@ class EvaluationRequest:
         task: The task that scores.
         config: The task's configuration; its condition values are evaluated at.
         space: The design space that baselines fill.
-        seed: Root of the drawn baselines and the bootstrap.
+        seed: Root of the drawn baselines.
         designs: The designs, by distinct names that are no baseline's.
         rays: Numbers of rays per frame; with conditions, per condition value. See `numbers_fired`.
         baselines: Names of baselines.
@@ -57,6 +57,7 @@ class EvaluationRequest:
         planner: The detector, and how the effects that are simulated are chosen.
         audit: Whether all rows are scored under all effects too.
         mount_error: Mounting errors of sensors in further rows; None: there are none.
+        losses: Whether all designs are scored with each of their sensors lost, not those alone that are made for it.
         starmap: How held-out scenes are scored: in this process, or by workers, to the same numbers.
         scenes_seed: Root of the held-out scenes; None: `seed`.
         alone: Those numbers of rays at which fixed patterns are evaluated without baselines and other designs.
@@ -80,6 +81,7 @@ class EvaluationRequest:
     planner: Planner = field(default_factory=Planner)
     audit: bool = False
     mount_error: MountError | None = None
+    losses: bool = False
     starmap: Starmap = itertools.starmap
     scenes_seed: int | None = None
     alone: Sequence[int] = ()
@@ -94,6 +96,12 @@ class EvaluationRequest:
         """The meaning of scores."""
         with plugin_guard(self.task.name):
             return metric_of(self.task, self.config)
+
+    @property
+    def losing(self) -> dict[str, int]:
+        """The numbers of sensors of designs that are scored with each of them lost, by the designs' names."""
+        own = [design for design in self.designs if self.losses or design.constraints.get("survive")]
+        return {design.name: len(design.sensors) for design in own}
 
     def check(self) -> None:
         """Refuse an invalid request.
