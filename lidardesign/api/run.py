@@ -131,6 +131,8 @@ class Run(RunFolder):
         name: str | None = None,
         seed: int | None = None,
         certify: bool = False,
+        detector: Path | str | None = None,
+        settings: Sequence[str] | Mapping[str, Any] = (),
         survive: int | None = None,
         goal: float | None = None,
         least: str | None = None,
@@ -141,7 +143,7 @@ class Run(RunFolder):
         """Fit a design to the learned density; nothing is learned again, and nothing is saved yet.
 
         Arguments:
-            sensors: How many, or "best" (the default): as many as score best on training scenes.
+            sensors: How many, or "best" (the default): as many as score best on training scenes; of parts also "1-4".
             constraints: Constraints, a mapping of them, or a YAML file of them.
             rays: Rays per frame over all sensors.
             layout: chosen, even or spinning; by default chosen, where the task has a method `informs`.
@@ -155,6 +157,8 @@ class Run(RunFolder):
             name: The design's name.
             seed: Seed of all random numbers; the run's by default.
             certify: Whether every number of rays gets a certificate, not the middle one alone.
+            detector: The detector that judges sets of parts and numbers of sensors: a name, or a YAML file.
+            settings: Settings of the task, to choose in scenes other than the learned ones.
             survive: 1: rays are chosen for the loss of any one sensor, too; by default as constraints say.
             goal: The score that it has to keep on training scenes that were held back, in the metric's unit.
             least: What it then has the least of: bandwidth (the default), rays, sensors or parts.
@@ -182,6 +186,8 @@ class Run(RunFolder):
             name=name,
             seed=seed,
             certify=certify,
+            detector=detector,
+            settings=settings,
             survive=survive,
             goal=goal,
             least=least,

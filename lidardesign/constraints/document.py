@@ -137,11 +137,19 @@ class Origin(_Keys):
         return self
 
 
+class RollRange(_Keys):
+    """Bounds on a roll about the boresight, which further rolls equal with the two fields exchanged [degrees]."""
+
+    min: Annotated[float, Field(ge=-45, le=45)] | None = None
+    max: Annotated[float, Field(ge=-45, le=45)] | None = None
+
+
 class Boresight(_Keys):
-    """Bounds on the boresight of a sensor [degrees]."""
+    """Bounds on the boresight of a sensor and its roll [degrees]."""
 
     azimuth_deg: AngleRange = AngleRange()
     elevation_deg: ElevationRange = ElevationRange()
+    roll_deg: RollRange = RollRange()
 
 
 class FieldOfView(_Keys):
@@ -176,6 +184,12 @@ class MostOfPart(_Keys):
     max: Count
 
 
+class PartPrice(_Keys):
+    """The largest price of all parts together, as `{max: 40}`."""
+
+    max: Positive
+
+
 class Parts(_Keys):
     """Real parts that the design is made of, chosen with their poses.
 
@@ -184,12 +198,21 @@ class Parts(_Keys):
         count: Number of parts; `--sensors` takes precedence.
         each: The largest number of a part, by its name.
         power_w: Largest power of all parts [W]; parts without a stated power are left out.
+        price: Largest price of all parts, as `{max: 40}`; parts without a price are left out.
     """
 
     names: Annotated[list[Annotated[str, Field(min_length=1)]], Field(min_length=1)] | Literal["catalog"] = "catalog"
     count: Count | None = None
     each: dict[str, MostOfPart] = {}
     power_w: Positive | None = None
+    price: PartPrice | None = None
+
+    @property
+    def sums(self) -> dict[str, tuple[str, float]]:
+        """The bounds on sums over all parts: the figure of a part and the bound, by key."""
+        price = None if self.price is None else self.price.max
+        bounds = {"parts.power_w": ("power_w", self.power_w), "parts.price.max": ("price", price)}
+        return {key: (name, bound) for key, (name, bound) in bounds.items() if bound is not None}
 
 
 class SensorConstraints(_Keys):

@@ -24,7 +24,17 @@ from lidardesign.constraints.document import Constraints, merged
 from lidardesign.constraints.feasibility import check_feasible
 from lidardesign.constraints.origins import placement_notes
 from lidardesign.errors import BackgroundNote, DataError, InfeasibleError
-from lidardesign.fitting.request import BEST, COUNTS, KEY, FitRequest, FitResult, RunTarget, Weighting, check_several
+from lidardesign.fitting.request import (
+    BEST,
+    COUNTS,
+    KEY,
+    WORLD,
+    FitRequest,
+    FitResult,
+    RunTarget,
+    Weighting,
+    check_several,
+)
 from lidardesign.formats.designs import relative_folder
 from lidardesign.mixture.fit import FitProblem, FittedSensors, fit_sensors
 from lidardesign.mixture.support import LEAST_SAMPLES, MOVED_SAMPLES, Retarget, at_condition, condition_text
@@ -99,9 +109,10 @@ def fit_design(
         "versions": versions(),
     }
     weighting = {KEY: request.weighting.as_document()} if request.weighting.settings else {}
+    world = {WORLD: request.world} if request.world else {}
     with plugin_guard(run.task.name):
         mount = mount_of(run.task, run.config.task)
-    design = replace(design, mount=mount, provenance={**design.provenance, **origin, **weighting})
+    design = replace(design, mount=mount, provenance={**design.provenance, **origin, **weighting, **world})
     with phase("writing"):
         return replace(result, design=design, constraints=check_written(design, request))
 
@@ -163,7 +174,8 @@ class Fitter:
                 run = replace(run, config=config)
             self.samples = self._at(loaded)
         # scenes are judged from where the design is
-        here = replace(run.config, space=run.config.space.at(request.at))
+        seen = with_task_settings(run.task, run.config, request.settings) if request.settings else run.config
+        here = replace(seen, space=run.config.space.at(request.at))
         self.training = TrainingScenes(replace(run, config=here), request.seed, starmap, keeps=samples is None)
         space = run.config.space
         is_fixed = {axis for axis in range(3) if axis in space.free} <= set(space.conditioned)
@@ -196,7 +208,7 @@ class Fitter:
         # scoring loads compiled loops, which a given number of sensors does without
         from lidardesign.fitting.trials import HeldBackScenes
 
-        return HeldBackScenes(self.training)
+        return HeldBackScenes(self.training, self.request.planner)
 
     @cached_property
     def pool(self) -> CandidatePool | None:
@@ -363,23 +375,15 @@ class Fitter:
         found = ", ".join(f"{one.sensors}: {one.scores.mean():.4g} in {one.mbps:.3g} Mbit/s" for one in trials)
         text = f"sensors: {best.sensors}; {metric.name} [{metric.unit}] on {len(best.scores)} training scenes "
         self.notes(BackgroundNote(f"{text}by their number: {found}"))
+        for line in self.scenes.effects:
+            self.notes(BackgroundNote(line))
         return best.sensors
 
     def _parts(self, request: FitRequest, notes: Notes) -> FitResult:
         from lidardesign.fitting.part_design import choose_parts
 
-        return choose_parts(
-            self.samples,
-            request.constraints,
-            count=request.sensors,
-            rays=request.rays,
-            informs=partial(checked_information, request.run.task),
-            scenes=self.training.scenes,
-            seed=request.seed,
-            name=request.name,
-            notes=notes,
-            progress=self.progress,
-        )
+        informs = partial(checked_information, request.run.task)
+        return choose_parts(self.samples, request, self.training, informs, notes, self.progress)
 
     def _rings(self) -> FitResult:
         from lidardesign.fitting.spinning import CHANNELS, choose_rings

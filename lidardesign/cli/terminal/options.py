@@ -152,8 +152,8 @@ Sensors = Annotated[
     str | None,
     typer.Option(
         "--sensors",
-        metavar="N|best",
-        help="Number of sensors; best: by the task's score on training scenes.",
+        metavar="N|N-M|best",
+        help="Number of sensors; best: by the task's score on training scenes; N-M: of parts, a table and its best.",
         show_default="the design's, else best",
     ),
 ]
@@ -165,6 +165,22 @@ Parts = Annotated[
         help="Make the design of real parts (catalog names, NAME:MODE, part files), chosen with their poses; "
         "--sensors says how many.",
         show_default=False,
+    ),
+]
+Judge = Annotated[
+    str | None,
+    typer.Option(
+        "--detector",
+        metavar="NAME|FILE",
+        help="Judge sets of parts and numbers of sensors under a detector (see `evaluate`).",
+        show_default="ideal",
+        autocompletion=detectors,
+    ),
+]
+SceneSettings = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set", metavar="KEY=VALUE", help="A key of the task: choose in other scenes than were learned; repeatable."
     ),
 ]
 Weights = Annotated[

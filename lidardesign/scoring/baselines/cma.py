@@ -147,7 +147,9 @@ class MovableSensors:
         if axes.vertical:
             sides[..., ELEVATION] = bounds.elevation_low - self._aim[:, 1], bounds.elevation_high - self._aim[:, 1]
         if axes.angular == 2:
-            sides[..., ROLL] = np.array([-math.pi, math.pi])[:, None]
+            rolls = np.stack([bounds.roll_low, bounds.roll_high])
+            is_bounded = np.ptp(rolls, axis=0) < math.pi / 2
+            sides[..., ROLL] = np.where(is_bounded, rolls - self._aim[:, 2], np.array([[-math.pi], [math.pi]]))
         wide = np.array([axes.horizontal, axes.vertical]) & (spread > 0)
         widest = np.minimum(bounds.spread_high * [axes.angle_scale, 1.0], math.pi / 2 / bounds.interval)
         ends = np.stack([bounds.spread_low * [axes.angle_scale, 1.0], widest]) / np.where(wide, spread, 1.0)
