@@ -147,4 +147,4 @@ def relative_difference(first: Any, second: Any, groups: Any = None) -> Interval
 
 def as_percent(interval: Interval) -> Interval:
     """The interval of a ratio less 1 [%] from that of its logarithm."""
-    return Interval(*(None if one is None else PERCENT * math.expm1(one) for one in interval))
+    return Interval._make(None if one is None else PERCENT * math.expm1(one) for one in interval)

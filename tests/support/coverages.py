@@ -37,10 +37,7 @@ def small(seed, rays=7, gates=2, items=12, scenes=3, table=LARGEST, harm=0.0):
 
 
 def relaxed_by_highs(coverage, count, price, integral, *, full=False):
-    """The facility location problem of one sensor as a program: rays' gates x, and who serves each item y <= x.
-
-    At most `count` rays fire, exactly so many where it is `full`.
-    """
+    """At most `count` rays of one sensor, or so many, as a program: gates x, and who serves each item y <= x."""
     rays, gates = coverage.shape
     ray_of = coverage.ray
     pairs = [(e, g) for e in range(len(coverage.item)) for g in range(gates) if coverage.gates[e] >> g & 1]
