@@ -220,9 +220,7 @@ Goal = Annotated[
 LEAST = "bandwidth|rays|sensors|parts"
 Least = Annotated[
     str | None,
-    typer.Option(
-        "--least", metavar=LEAST, help="What --goal takes least of; else bandwidth.", autocompletion=words(LEAST)
-    ),
+    typer.Option("--least", metavar=LEAST, help="What --goal saves; else bandwidth.", autocompletion=words(LEAST)),
 ]
 Preset = Annotated[
     str | None,
