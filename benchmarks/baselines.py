@@ -105,13 +105,13 @@ def standing(pair: Mapping[str, Any], better: str) -> str:
     return "better" if lower == (better == "lower") else "worse"
 
 
-def told(pair: Mapping[str, Any] | None, other: float, better: str) -> str:
-    """A paired difference with its interval, in percent of the other's value, and what it says."""
+def told(pair: Mapping[str, Any] | None, better: str) -> str:
+    """By how much `a` is above `b` with its interval, in percent, and what the difference says."""
     if pair is None:
         return ""
-    if not other:
+    if pair["percent"] is None:
         return standing(pair, better)
-    low, middle, high = (100 * pair[key] / other for key in ("ci_low", "difference", "ci_high"))
+    middle, low, high = pair["percent"]
     return f"{middle:+.1f} ({low:+.1f} to {high:+.1f}), {standing(pair, better)}"
 
 
@@ -127,7 +127,7 @@ def equal_rays(found: Mapping[str, Any]) -> list[list[object]]:
     rows: list[list[object]] = []
     for row in sorted(found["rows"], key=lambda row: row["rays"]):
         count, other, value = row["rays"], row["design"], row["value"]
-        against = [told(pairs.get((name, other, count)), value, found["metric"]["better"]) for name in ours_of(found)]
+        against = [told(pairs.get((name, other, count)), found["metric"]["better"]) for name in ours_of(found)]
         interval = f"{row['ci_low']:.3g} to {row['ci_high']:.3g}"
         rows.append([count, other, value, interval, row["bandwidth_mbps"], *against])
     return rows
@@ -140,7 +140,7 @@ def equal_bandwidth(found: Mapping[str, Any]) -> list[list[object]]:
     rows = []
     for row in sorted(found["equal_bandwidth"], key=lambda row: (row["matched_rays"], row["matched_to"])):
         ours, count = row["matched_to"], row["matched_rays"]
-        against = told(pairs.get((ours, row["design"], count)), row["value"], found["metric"]["better"])
+        against = told(pairs.get((ours, row["design"], count)), found["metric"]["better"])
         rows.append([count, ours, spent[ours, count], row["design"], row["rays"], row["value"], against])
     return rows
 
@@ -193,16 +193,14 @@ def page_tables(found: Mapping[str, Any]) -> list[str]:
     middle = counts[(len(counts) - 1) // 2]
     ours, better = ours_of(found)[0], found["metric"]["better"]
     pairs = {pair["b"]: pair for pair in found["paired"] if (pair["a"], pair["rays"]) == (ours, middle)}
-    same = [row for row in found["equal_bandwidth"] if (row["matched_to"], row["matched_rays"]) == (ours, middle)]
-    matched = {row["design"]: row["value"] for row in same}
     paired = {p["b"]: p for p in found["paired_equal_bandwidth"] if (p["a"], p["rays"]) == (ours, middle)}
     scores, differences = [], []
     for name in dict.fromkeys(row["design"] for row in found["rows"]):
         values = [rows[name, count]["value"] for count in counts]
         scores.append([f"`{name}`", *values, rows[name, middle]["bandwidth_mbps"]])
         if name in pairs:
-            at_its_bandwidth = told(paired.get(name), matched.get(name, 0.0), better)
-            differences.append([f"`{name}`", told(pairs[name], values[counts.index(middle)], better), at_its_bandwidth])
+            at_its_bandwidth = told(paired.get(name), better)
+            differences.append([f"`{name}`", told(pairs[name], better), at_its_bandwidth])
     columns = [found["metric"]["unit"], *(f"{count} rays" for count in counts), f"Mbit/s at {middle}"]
     against = [f"`{ours}` against", f"at {middle} rays, %", "in the same bandwidth, %"]
     return [table(columns, scores), table(against, differences)]

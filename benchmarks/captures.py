@@ -68,7 +68,7 @@ def add_rows(
         figures.setdefault(key, []).append((found["outliers_percent"] or 0.0, found["chamfer_mm"]))
 
 
-def figure_rows(figures: Figures, seed: int) -> list[list[object]]:
+def figure_rows(figures: Figures) -> list[list[object]]:
     """Means over heads with 95 % intervals, and the difference to uniform rays head by head."""
     import numpy as np
 
@@ -80,8 +80,8 @@ def figure_rows(figures: Figures, seed: int) -> list[list[object]]:
         uniform = np.array(figures[estimator, "uniform", "whole"], dtype=np.float64)
         cells: list[object] = [estimator, name, KINDS[gate]]
         for column in (0, 1):
-            mean, low, high = mean_interval(mine[:, column], seed)
-            apart = paired_difference(mine[:, column], uniform[:, column], seed)
+            mean, low, high = mean_interval(mine[:, column])
+            apart = paired_difference(mine[:, column], uniform[:, column])
             against = "-" if name == "uniform" else f"{apart.mean:.3g} ({apart.low:.3g} to {apart.high:.3g})"
             cells += [f"{mean:.3g} ({low:.3g} to {high:.3g})", against]
         rows.append(cells)
@@ -151,7 +151,7 @@ def measure(run_folder: Path, options: Any, folder: Path) -> None:
         {
             "Means over held-out heads with 95 % intervals, differences head by head": (
                 columns,
-                figure_rows(figures, run.config.seed),
+                figure_rows(figures),
             ),
             "Travel of the mirrors per frame, and the processor time of finding it": (
                 tours,

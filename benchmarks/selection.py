@@ -113,7 +113,7 @@ def small_problems(options: Any) -> list[list[object]]:
         found = []
         for seed in range(options.problems):
             coverage, counts = small(seed, rays=40, items=30, scenes=4), RayCounts.of_one(40, 8)
-            certificate = certify(coverage, counts, choose(coverage, counts, price=price, full=False))
+            certificate = certify(coverage, counts, choose(coverage, counts, price=price, full=False), full=False)
             linear, best = (relaxed_by_highs(coverage, 8, price, integral) for integral in (False, True))
             found.append((certificate.value / best, certificate.bound / best, certificate.bound / linear))
         value, bound, relaxed = np.transpose(found)

@@ -57,7 +57,7 @@ def add_scene(request: Any, entries: list[Any], tallies: list[Tally], scene: Any
     from lidardesign.simulate.returns import build_casters, simulate_many
 
     casters = build_casters(scene)
-    lists = [entry.positions[0] for entry in entries]
+    lists = [entry.lit_in(0)[0] for entry in entries]
     plan = request.planner.plan(scene, lists, casters)
     variants = {"all": plan.effects, "calm": plan.effects - {"ambient"}, "single": plan.effects - {"pile_up"}}
     for name, effects in variants.items():
@@ -113,10 +113,8 @@ def figure_rows(entries: list[Any], tallies: list[Tally]) -> list[list[object]]:
     ]
 
 
-def paired_rows(entries: list[Any], tallies: list[Tally], seed: int) -> list[list[object]]:
+def paired_rows(entries: list[Any], tallies: list[Tally]) -> list[list[object]]:
     """Every design against every baseline at equal rays, scene by scene."""
-    import numpy as np
-
     from lidardesign.scoring.statistics import paired_difference
 
     rows = []
@@ -126,9 +124,7 @@ def paired_rows(entries: list[Any], tallies: list[Tally], seed: int) -> list[lis
                 continue
             cells: list[object] = [entry.name, other.name, entry.rays]
             for name in ("chamfer_mm", "outliers"):
-                mean, low, high = paired_difference(
-                    np.array(getattr(tally, name)), np.array(getattr(against, name)), seed
-                )
+                mean, low, high = paired_difference(getattr(tally, name), getattr(against, name))
                 cells += [mean, f"{low:.3g} to {high:.3g}"]
             rows.append(cells)
     return rows
@@ -164,7 +160,7 @@ def measure(run_folder: Path, options: Any) -> None:
     columns = ["design", "rays", "Chamfer [mm]", "outliers [%]", "without ambient [%]", "without pile-up [%]",
                "returned [%]", "background per gate", "pulses blinded [%]", "false peak, at most [%]"]  # fmt: skip
     differences = ["design", "against", "rays", "Chamfer [mm]", "interval", "outliers [points]", "interval"]
-    pairs = paired_rows(entries, tallies, request.seed)
+    pairs = paired_rows(entries, tallies)
     report(
         f"Sunlight, detector {options.detector}",
         {

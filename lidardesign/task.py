@@ -7,6 +7,7 @@ A plugin is a class with the members of `Task`, registered under the entry-point
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -101,6 +102,7 @@ class Metric:
         better: Whether lower or higher values are better.
         worst: Value of a scene in which a design fails.
         tolerance: Differences below this do not matter to the task.
+        best: The best value that a scene can have; None: 0 where lower is better, unknown where higher is.
     """
 
     name: str
@@ -108,6 +110,14 @@ class Metric:
     better: Literal["lower", "higher"]
     worst: float
     tolerance: float
+    best: float | None = None
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """The least and the largest value, infinite where the best one is unknown."""
+        if self.better == "higher":
+            return self.worst, math.inf if self.best is None else self.best
+        return (0.0 if self.worst > 0 else -math.inf) if self.best is None else self.best, self.worst
 
 
 @dataclass(frozen=True)

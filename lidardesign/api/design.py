@@ -113,6 +113,9 @@ class Design(DesignSource):
         name: str | None = None,
         seed: int | None = None,
         certify: bool = False,
+        detector: Path | str | None = None,
+        settings: Sequence[str] | Mapping[str, Any] = (),
+        survive: int | None = None,
         goal: float | None = None,
         least: str | None = None,
         workers: int | str = 1,
@@ -136,6 +139,9 @@ class Design(DesignSource):
             name: The design's name; "constrained" by default.
             seed: Seed of all random numbers; the run's by default.
             certify: Whether every number of rays gets a certificate, not the middle one alone.
+            detector: The detector that judges sets of parts and numbers of sensors: a name, or a YAML file.
+            settings: Settings of the task, to choose in scenes other than the learned ones.
+            survive: 1: rays are chosen for the loss of any one sensor, too; by default as constraints say.
             goal: The score that it has to keep on training scenes that were held back, in the metric's unit.
             least: What it then has the least of: bandwidth (the default), rays, sensors or parts.
             workers: Processes that look at training scenes, or the address of a dask scheduler, tcp://HOST:PORT.
@@ -162,6 +168,9 @@ class Design(DesignSource):
             name=name,
             seed=seed,
             certify=certify,
+            detector=detector,
+            settings=settings,
+            survive=survive,
             goal=goal,
             least=least,
         )

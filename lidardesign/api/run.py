@@ -131,6 +131,9 @@ class Run(RunFolder):
         name: str | None = None,
         seed: int | None = None,
         certify: bool = False,
+        detector: Path | str | None = None,
+        settings: Sequence[str] | Mapping[str, Any] = (),
+        survive: int | None = None,
         goal: float | None = None,
         least: str | None = None,
         workers: int | str = 1,
@@ -140,7 +143,7 @@ class Run(RunFolder):
         """Fit a design to the learned density; nothing is learned again, and nothing is saved yet.
 
         Arguments:
-            sensors: How many, or "best" (the default): as many as score best on training scenes.
+            sensors: How many, or "best" (the default): as many as score best on training scenes; of parts also "1-4".
             constraints: Constraints, a mapping of them, or a YAML file of them.
             rays: Rays per frame over all sensors.
             layout: chosen, even or spinning; by default chosen, where the task has a method `informs`.
@@ -154,6 +157,9 @@ class Run(RunFolder):
             name: The design's name.
             seed: Seed of all random numbers; the run's by default.
             certify: Whether every number of rays gets a certificate, not the middle one alone.
+            detector: The detector that judges sets of parts and numbers of sensors: a name, or a YAML file.
+            settings: Settings of the task, to choose in scenes other than the learned ones.
+            survive: 1: rays are chosen for the loss of any one sensor, too; by default as constraints say.
             goal: The score that it has to keep on training scenes that were held back, in the metric's unit.
             least: What it then has the least of: bandwidth (the default), rays, sensors or parts.
             workers: Processes that look at training scenes, or the address of a dask scheduler, tcp://HOST:PORT.
@@ -180,6 +186,9 @@ class Run(RunFolder):
             name=name,
             seed=seed,
             certify=certify,
+            detector=detector,
+            settings=settings,
+            survive=survive,
             goal=goal,
             least=least,
         )
@@ -252,6 +261,7 @@ class Run(RunFolder):
         return_tolerance: float | None = None,
         settings: Sequence[str] | Mapping[str, Any] = (),
         mount_error: str | None = None,
+        losses: bool = False,
         workers: int | str = 1,
         cma_seconds: float | None = None,
         accuracy: bool = False,
@@ -274,6 +284,7 @@ class Run(RunFolder):
             return_tolerance: Largest share of returns changed by all skipped effects together.
             settings: Settings of the task, to score in scenes other than the learned ones.
             mount_error: Standard deviations of mounting errors of sensors in further rows, as "5mm,0.5deg".
+            losses: Whether designs are scored with each of their sensors lost, too; those made for it always are.
             workers: Processes that score scenes, or the address of a dask scheduler, tcp://HOST:PORT.
             cma_seconds: Wall time of each search of the baseline cma [s].
             accuracy: Whether the sweeps of accuracy are measured, too; takes minutes.
@@ -299,6 +310,7 @@ class Run(RunFolder):
             return_tolerance=return_tolerance,
             settings=settings,
             mount_error=mount_error,
+            losses=losses,
             workers=workers,
             cma_seconds=cma_seconds,
             accuracy=accuracy,

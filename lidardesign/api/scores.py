@@ -65,6 +65,7 @@ class ScoreOptions:
         scenes_seed: Root of the held-out scenes; `seed` by default.
         designs: Names of the designs that are scored; all by default.
         mount_error: Standard deviations of mounting errors of sensors in further rows, as "5mm,0.5deg".
+        losses: Whether designs are scored with each of their sensors lost, too; those made for it always are.
         fail_above: Limit of the designs' values, in the metric's unit, for `Scores.check`.
         fail_unless_better: Baseline or design that every other design must be better than, likewise.
 
@@ -86,6 +87,7 @@ class ScoreOptions:
     scenes_seed: int | None = None
     designs: Sequence[str] = ()
     mount_error: str | None = None
+    losses: bool = False
     fail_above: float | None = None
     fail_unless_better: str | None = None
 
@@ -240,7 +242,13 @@ class ScoreRequest:
         cma = CmaSettings(self.cma_seconds, show=searching)
         misplaced = self.options.misplacement()
         return replace(
-            request, planner=self.planner, audit=self.audit, cma=cma, mount_error=misplaced, alone=self.alone
+            request,
+            planner=self.planner,
+            audit=self.audit,
+            cma=cma,
+            mount_error=misplaced,
+            losses=self.options.losses,
+            alone=self.alone,
         )
 
     def score(self, progress: Progress | None = None, searching: Show | None = None) -> Scores:

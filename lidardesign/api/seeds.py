@@ -60,6 +60,7 @@ def evaluate_seeds(
     return_tolerance: float | None = None,
     settings: Sequence[str] | Mapping[str, Any] = (),
     mount_error: str | None = None,
+    losses: bool = False,
     workers: int | str = 1,
     cma_seconds: float | None = None,
     fail_above: float | None = None,
@@ -81,6 +82,7 @@ def evaluate_seeds(
         return_tolerance: Largest share of returns changed by all skipped effects together.
         settings: Settings of the task, to score in scenes other than the learned ones.
         mount_error: Standard deviations of mounting errors of sensors in further rows, as "5mm,0.5deg".
+        losses: Whether designs are scored with each of their sensors lost, too; those made for it always are.
         workers: Processes that score scenes, or the address of a dask scheduler, tcp://HOST:PORT.
         cma_seconds: Wall time of each search of the baseline cma [s].
         fail_above: Limit of the designs' values, in the metric's unit, for `Scores.check()`.
@@ -104,6 +106,7 @@ def evaluate_seeds(
         return_tolerance=return_tolerance,
         settings=settings,
         mount_error=mount_error,
+        losses=losses,
         workers=workers,
         cma_seconds=cma_seconds,
         fail_above=fail_above,

@@ -164,12 +164,14 @@ def _origin(
 
 
 def _boresight(name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any], space: Any) -> list[ConstraintCheck]:
-    """Checks of a boresight's elevation and azimuth (on the circle); a missing end is the space's.
+    """Checks of a boresight's elevation, roll and azimuth (on the circle); a missing end is the space's.
 
     Without a space a single bound says little: it is then read as the half circle beyond it.
     """
     elevation = math.degrees(sensor["boresight"]["elevation_rad"])
     checks = _between(f"{name}.boresight.elevation_deg", elevation, _get(rules, "boresight", "elevation_deg"))
+    roll = math.degrees(sensor["boresight"].get("roll_rad") or 0.0)
+    checks += _between(f"{name}.boresight.roll_deg", roll, _get(rules, "boresight", "roll_deg"))
     given = _get(rules, "boresight", "azimuth_deg") or {}
     low, high = given.get("min"), given.get("max")
     if low is None and high is None:
@@ -381,10 +383,10 @@ def _parts(document: Mapping[str, Any], parts: Mapping[str, Any] | None) -> list
         checks.append(ConstraintCheck(name, part.name, wrong or part.name, wrong is None))
     for own, rule in (parts.get("each") or {}).items():
         checks += _between(f"parts.each.{own}", sum(part.name == own for part in found), rule)
-    limit = parts.get("power_w")
-    if limit is not None:
-        power = sum(math.inf if part.value("power_w") is None else part.value("power_w") for part in found)
-        checks += _between("parts.power_w", power, {"max": limit})
+    for name, rule in (("power_w", {"max": parts.get("power_w")}), ("price", parts.get("price") or {})):
+        if rule.get("max") is not None:
+            total = sum(math.inf if part.value(name) is None else part.value(name) for part in found)
+            checks += _between(f"parts.{name}", total, rule)
     return checks
 
 

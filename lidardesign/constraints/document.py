@@ -12,6 +12,7 @@ The meaning of the bounds, here and in `check`, which verifies them on the finis
   the intervals keep to that box too (see `origins`);
 - `boresight.azimuth_deg` is an interval on the circle: with `min` above `max` it passes through 0;
 - `parts` names real parts that the design is made of, whose fields of view and gates then keep these bounds;
+- `survive: 1` chooses rays for the loss of any one sensor, too;
 - every gate stays inside the range bounds of the design space, whatever the file says.
 
 Entries of `each` apply to the first, second, ... sensor over the common keys.
@@ -136,11 +137,19 @@ class Origin(_Keys):
         return self
 
 
+class RollRange(_Keys):
+    """Bounds on a roll about the boresight, which further rolls equal with the two fields exchanged [degrees]."""
+
+    min: Annotated[float, Field(ge=-45, le=45)] | None = None
+    max: Annotated[float, Field(ge=-45, le=45)] | None = None
+
+
 class Boresight(_Keys):
-    """Bounds on the boresight of a sensor [degrees]."""
+    """Bounds on the boresight of a sensor and its roll [degrees]."""
 
     azimuth_deg: AngleRange = AngleRange()
     elevation_deg: ElevationRange = ElevationRange()
+    roll_deg: RollRange = RollRange()
 
 
 class FieldOfView(_Keys):
@@ -175,6 +184,12 @@ class MostOfPart(_Keys):
     max: Count
 
 
+class PartPrice(_Keys):
+    """The largest price of all parts together, as `{max: 40}`."""
+
+    max: Positive
+
+
 class Parts(_Keys):
     """Real parts that the design is made of, chosen with their poses.
 
@@ -183,12 +198,21 @@ class Parts(_Keys):
         count: Number of parts; `--sensors` takes precedence.
         each: The largest number of a part, by its name.
         power_w: Largest power of all parts [W]; parts without a stated power are left out.
+        price: Largest price of all parts, as `{max: 40}`; parts without a price are left out.
     """
 
     names: Annotated[list[Annotated[str, Field(min_length=1)]], Field(min_length=1)] | Literal["catalog"] = "catalog"
     count: Count | None = None
     each: dict[str, MostOfPart] = {}
     power_w: Positive | None = None
+    price: PartPrice | None = None
+
+    @property
+    def sums(self) -> dict[str, tuple[str, float]]:
+        """The bounds on sums over all parts: the figure of a part and the bound, by key."""
+        price = None if self.price is None else self.price.max
+        bounds = {"parts.power_w": ("power_w", self.power_w), "parts.price.max": ("price", price)}
+        return {key: (name, bound) for key, (name, bound) in bounds.items() if bound is not None}
 
 
 class SensorConstraints(_Keys):
@@ -245,6 +269,7 @@ class Constraints(SensorConstraints):
     sensors: SensorCount = SensorCount()
     budget: Budget = Budget()
     parts: Parts | None = None
+    survive: Literal[0, 1] = 0
     each: list[SensorConstraints] = []
 
     @classmethod
@@ -278,6 +303,11 @@ class Constraints(SensorConstraints):
                 raise ConfigError(f"{name} has no value", where=locate(path), allowed="a value", hint=UNSET_HINT)
         return check_model(cls, values, locate)
 
+    @property
+    def least_sensors(self) -> int:
+        """The least number of sensors."""
+        return max(self.sensors.min or 1, len(self.each), 1 + self.survive)
+
     @cached_property
     def rules(self) -> tuple[SensorRules, ...]:
         """The rules of the sensor of each entry of `each`, and last those of every further sensor."""
@@ -292,7 +322,7 @@ class Constraints(SensorConstraints):
 
     def as_document(self) -> dict[str, Any]:
         """The plain values that were given, for the design file."""
-        return self.model_dump(exclude_none=True, exclude_unset=True)
+        return self.model_dump(exclude_none=True, exclude_unset=True, exclude=None if self.survive else {"survive"})
 
 
 def merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:

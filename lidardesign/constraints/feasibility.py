@@ -170,6 +170,13 @@ def _check_boresight(rules: SensorRules, space: DesignSpace) -> None:
         _refuse("the boresight's elevation lies above the design space", [low_name, "space.elevation_rad"])
     if elevation.max is not None and math.radians(elevation.max) < space.low[ELEVATION] - AGREEMENT:
         _refuse("the boresight's elevation lies below the design space", [high_name, "space.elevation_rad"])
+    roll = rules.boresight.roll_deg
+    low, high = -math.inf if roll.min is None else roll.min, math.inf if roll.max is None else roll.max
+    names = [rules.path(f"boresight.roll_deg.{end}") for end in ("min", "max") if getattr(roll, end) is not None]
+    if low > high:
+        _refuse(f"a roll of at least {low:g} and at most {high:g} degrees", names)
+    if not {AZIMUTH, ELEVATION} <= set(space.free) and not low <= 0 <= high:
+        _refuse("the roll is 0 where the design space holds all rays in a plane", [*names, "space"])
     ends = [end for end in ("min", "max") if getattr(azimuth, end) is not None]
     if not ends or space.full_azimuth:
         return

@@ -17,12 +17,13 @@ import numpy as np
 
 from lidardesign.constraints.document import Constraints, SensorRules, rules_of
 from lidardesign.errors import check_number
+from lidardesign.mixture.bounds import INWARD, bounds_of
 from lidardesign.mixture.fit import FittedSensors
 from lidardesign.numerics import COARSE_SLACK
 from lidardesign.rays.gates import GateLimits
 from lidardesign.rays.information import FEW_SCENES, MOST_SELECTED
 from lidardesign.rays.pool import CandidatePool, cached_information
-from lidardesign.rays.proposals import CANDIDATES_PER_RAY, Proposals, first_candidates, owners, rays_of_points
+from lidardesign.rays.proposals import CANDIDATES_PER_RAY, Proposals, first_candidates, rays_of_points
 from lidardesign.rays.selection import Selected, Selection, inform_enough, select
 from lidardesign.rays.training import CHOICE, InformedScene, TrainingScenes
 from lidardesign.run.clock import phase
@@ -30,8 +31,18 @@ from lidardesign.samples import Samples
 from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.bandwidth import Bandwidth, split_budget
 from lidardesign.sensors.pattern import Pattern
-from lidardesign.sensors.sensor import Sensor, tangent_directions
-from lidardesign.space import AZIMUTH, DIMENSIONS, ELEVATION, angles, direction
+from lidardesign.sensors.sensor import Sensor, interval_factor, tangent_directions
+from lidardesign.space import (
+    AZIMUTH,
+    DIMENSIONS,
+    ELEVATION,
+    RANGE,
+    DesignSpace,
+    aim,
+    angles,
+    direction,
+    observed_point,
+)
 from lidardesign.task import random_generator
 
 # Rounds in which a boresight moves to the middle of its rays: away from the poles it rests after two or three.
@@ -49,6 +60,7 @@ class ChosenRays(NamedTuple):
         certificates: Of the numbers of rays that were certified.
         idle: Indices of sensors that fire no ray at the largest number.
         silent: The share of scenes held back about which the largest number of rays has no information.
+        shared: The share of what sensors see that several of them see; 1 where none may fail.
     """
 
     sensors: tuple[Sensor, ...]
@@ -56,6 +68,7 @@ class ChosenRays(NamedTuple):
     certificates: tuple[dict[str, object], ...]
     idle: tuple[int, ...]
     silent: float
+    shared: float = 1.0
 
 
 def choose_rays(
@@ -96,8 +109,11 @@ def choose_rays(
     """
     check_number(counts[-1], "--rays", 1, MOST_SELECTED)
     budget, conditions = constraints.budget, training.run.conditions(samples.space)
-    proposals = Proposals(fitted.sensors, constraints.rules, level, samples)
-    wanted, weights = CANDIDATES_PER_RAY * counts[-1], np.array([sensor.weight for sensor in fitted.sensors])
+    placed, may_fail = fitted.sensors, bool(constraints.survive)
+    if may_fail:
+        placed = widened(placed, constraints.rules, level, samples)
+    proposals = Proposals(placed, constraints.rules, level, samples, by_turns=may_fail)
+    wanted, weights = CANDIDATES_PER_RAY * counts[-1], np.array([sensor.weight for sensor in placed])
     least = np.full(len(weights), CANDIDATES_PER_RAY if each_fires else 0)
     if len(conditions) > 1:
         # so that patterns along a condition fire as many rays of each sensor everywhere
@@ -105,9 +121,7 @@ def choose_rays(
     picked = None if pool is None else _picked(pool, proposals, conditions, wanted, least)
     lists = picked[0] if picked else _drawn(proposals, conditions, wanted, least, training.seed)
     ends = np.cumsum([0, *map(len, lists)]).tolist()
-    limits = GateLimits(
-        fitted.sensors, constraints.rules, level, samples.space, training.margin_m, is_shared=gates != "ray"
-    )
+    limits = GateLimits(placed, constraints.rules, level, samples.space, training.margin_m, is_shared=gates != "ray")
     selection = Selection(
         rays=Rays.joined(lists),
         visits=[slice(*pair) for pair in itertools.pairwise(ends)],
@@ -117,6 +131,7 @@ def choose_rays(
         shares=weights if len(lists) > 1 else None,
         is_shared=gates != "ray",
         each_fires=each_fires,
+        may_fail=may_fail,
     )
     if picked:
         informed, held_back = picked[1:]
@@ -129,10 +144,10 @@ def choose_rays(
         informed, held_back = inform(selection, training, counts[len(counts) // 2], progress)
     selected = select(selection, informed, held_back, counts, certified, progress)
     patterns = tuple(_pattern(one, conditions, samples) for one in selected)
-    per_sensor = patterns[-1].per_sensor(len(fitted.sensors))
+    per_sensor = patterns[-1].per_sensor(len(placed))
     sensors = tuple(
         _around_rays(sensor, index, patterns, rules_of(constraints.rules, index), samples)
-        for index, sensor in enumerate(fitted.sensors)
+        for index, sensor in enumerate(placed)
     )
     shares = per_sensor / per_sensor.sum()
     return ChosenRays(
@@ -141,6 +156,7 @@ def choose_rays(
         tuple(one.certificate for one in selected if one.certificate is not None),
         tuple(np.flatnonzero(per_sensor == 0).tolist()),
         selected[-1].silent,
+        proposals.share_of_several(conditions[len(conditions) // 2]) if may_fail else 1.0,
     )
 
 
@@ -162,7 +178,7 @@ def _picked(
     number, known, lists = np.full(len(pool.points), -1), 0, []
     for visit, at in zip(pool.visits, conditions, strict=True):
         sensors, points = proposals.sensors_at(at), pool.points[visit]
-        owner, fired = owners(sensors, proposals.rules, proposals.level, points, proposals.samples.space.at(at))
+        owner, fired = proposals.owners(sensors, points, proposals.samples.space.at(at))
         inside = np.flatnonzero(owner >= 0)
         chosen = inside[first_candidates(owner[inside], count, least)]
         if len(chosen) < count or (np.bincount(owner[chosen], minlength=len(least)) < least).any():
@@ -194,11 +210,22 @@ def _around_rays(
     gate_m = np.concatenate([pattern.gate_m[:, own].reshape(-1, 2) for pattern, own in rows])
     if not len(gate_m):
         return sensor
-    looking, widest = direction(azimuth_rad, elevation_rad), np.array(sensor.field_of_view_rad)
-    fields, bounds = rules.field_of_view, rules.boresight
+    looking = direction(azimuth_rad, elevation_rad)
+    return replace(
+        smallest_field(sensor, looking, rules, samples.space),
+        gate_m=(float(gate_m[:, 0].min()), float(gate_m[:, 1].max())),
+    )
+
+
+def smallest_field(sensor: Sensor, looking: np.ndarray, rules: SensorRules, space: DesignSpace) -> Sensor:
+    """The sensor, turned where it may turn, with the smallest field inside its own that holds directions (N, 3).
+
+    It is unchanged where no field inside its own holds them.
+    """
+    widest, fields, bounds = np.array(sensor.field_of_view_rad), rules.field_of_view, rules.boresight
     least = np.radians([fields.horizontal_deg.min or 0.0, fields.vertical_deg.min or 0.0])
     ends = (bounds.azimuth_deg.min, bounds.azimuth_deg.max, bounds.elevation_deg.min, bounds.elevation_deg.max)
-    may_turn = all(end is None for end in ends) and {AZIMUTH, ELEVATION} <= set(samples.space.free)
+    may_turn = all(end is None for end in ends) and {AZIMUTH, ELEVATION} <= set(space.free)
     tried, best, smallest = sensor, sensor, math.inf
     for _ in range(CENTRING_ROUNDS if may_turn else 1):
         tangent = tried.tangent_of(looking)
@@ -210,4 +237,43 @@ def _around_rays(
         middle = (tangent.min(axis=0) + tangent.max(axis=0)) / 2
         azimuth, elevation = (float(angle) for angle in angles(tangent_directions(tried.frame, middle[None])[0]))
         tried = replace(tried, azimuth_rad=azimuth, elevation_rad=elevation)
-    return replace(best, gate_m=(float(gate_m[:, 0].min()), float(gate_m[:, 1].max())))
+    return best
+
+
+def widened(
+    sensors: Sequence[Sensor], rules: Sequence[SensorRules], level: float, samples: Samples
+) -> tuple[Sensor, ...]:
+    """Sensors of equal shares that see as much of the density as constraints allow, so that each can replace others."""
+    wide = [_widened(sensor, index, rules, level, samples) for index, sensor in enumerate(sensors)]
+    return tuple(replace(sensor, weight=1 / len(wide)) for sensor in wide)
+
+
+def _widened(sensor: Sensor, index: int, rules: Sequence[SensorRules], level: float, samples: Samples) -> Sensor:
+    space, own = samples.space, rules_of(rules, index)
+    origins = samples.points[:, :3].copy()
+    if sensor.origin_covariance_m2 is None:
+        placed = [axis for axis in range(3) if axis not in space.conditioned]
+        origins[:, placed] = np.asarray(sensor.origin_m)[placed]
+    points = space.wrap(aim(origins, observed_point(samples.points)))
+    looking = direction(points[:, AZIMUTH], points[:, ELEVATION])
+    values = np.column_stack([sensor.tangent_of(looking), points[:, RANGE]])
+    low, high = np.transpose([central_share(column, samples.weights, level) for column in values.T])
+    inside = ((low <= values) & (values <= high)).all(axis=1)
+    bounds = bounds_of(rules, space, (index,), interval_factor(level))
+    start = max(min(float(low[-1]), sensor.gate_m[0]), float(bounds.start_low[0]))
+    end = min(max(float(high[-1]), sensor.gate_m[1]), float(bounds.end_high[0]))
+    limits = (own.field_of_view.horizontal_deg.max, own.field_of_view.vertical_deg.max)
+    view = tuple(
+        (2 * math.pi if limit is None else (1 - INWARD) * math.radians(limit)) if field > 0 else 0.0
+        for field, limit in zip(sensor.field_of_view_rad, limits, strict=True)
+    )
+    gate_m = (start, end) if end - start <= bounds.width_high[0] else sensor.gate_m
+    return smallest_field(replace(sensor, field_of_view_rad=view, gate_m=gate_m), looking[inside], own, space)
+
+
+def central_share(values: np.ndarray, weights: np.ndarray, level: float) -> tuple[float, float]:
+    """The ends of the central share of weighted values, (N,) each."""
+    order = np.argsort(values, kind="stable")
+    below = np.cumsum(weights[order]) / weights.sum()
+    first, last = np.searchsorted(below, [(1 - level) / 2, (1 + level) / 2])
+    return float(values[order[first]]), float(values[order[min(last, len(order) - 1)]])

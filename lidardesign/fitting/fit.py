@@ -24,8 +24,17 @@ from lidardesign.constraints.document import Constraints, merged
 from lidardesign.constraints.feasibility import check_feasible
 from lidardesign.constraints.origins import placement_notes
 from lidardesign.errors import BackgroundNote, DataError, InfeasibleError
-from lidardesign.fitting.request import BEST, COUNTS, KEY, FitRequest, FitResult, RunTarget, Weighting
-from lidardesign.fitting.trials import GoalSearch, HeldBackScenes, best_of, trials_of
+from lidardesign.fitting.request import (
+    BEST,
+    COUNTS,
+    KEY,
+    WORLD,
+    FitRequest,
+    FitResult,
+    RunTarget,
+    Weighting,
+    check_several,
+)
 from lidardesign.formats.designs import relative_folder
 from lidardesign.mixture.fit import FitProblem, FittedSensors, fit_sensors
 from lidardesign.mixture.support import LEAST_SAMPLES, MOVED_SAMPLES, Retarget, at_condition, condition_text
@@ -44,10 +53,13 @@ from lidardesign.task import mount_of, random_generator
 from lidardesign.workers import Starmap
 
 if TYPE_CHECKING:
+    from lidardesign.fitting.trials import HeldBackScenes
     from lidardesign.rays.pool import CandidatePool
 
 # A larger share of scenes without information from a design is noted.
 MOST_SILENT = 0.5
+# So much of what sensors see is seen by several, or a note says so where a sensor may fail.
+LEAST_SHARED = 0.9
 # As many samples as the standard preset of `learn` leaves.
 TWIN_SAMPLES = 100_000
 TWIN_NAME = "no-visibility"
@@ -97,9 +109,10 @@ def fit_design(
         "versions": versions(),
     }
     weighting = {KEY: request.weighting.as_document()} if request.weighting.settings else {}
+    world = {WORLD: request.world} if request.world else {}
     with plugin_guard(run.task.name):
         mount = mount_of(run.task, run.config.task)
-    design = replace(design, mount=mount, provenance={**design.provenance, **origin, **weighting})
+    design = replace(design, mount=mount, provenance={**design.provenance, **origin, **weighting, **world})
     with phase("writing"):
         return replace(result, design=design, constraints=check_written(design, request))
 
@@ -161,7 +174,8 @@ class Fitter:
                 run = replace(run, config=config)
             self.samples = self._at(loaded)
         # scenes are judged from where the design is
-        here = replace(run.config, space=run.config.space.at(request.at))
+        seen = with_task_settings(run.task, run.config, request.settings) if request.settings else run.config
+        here = replace(seen, space=run.config.space.at(request.at))
         self.training = TrainingScenes(replace(run, config=here), request.seed, starmap, keeps=samples is None)
         space = run.config.space
         is_fixed = {axis for axis in range(3) if axis in space.free} <= set(space.conditioned)
@@ -191,7 +205,10 @@ class Fitter:
     @cached_property
     def scenes(self) -> HeldBackScenes:
         """The scenes that all trials are scored on."""
-        return HeldBackScenes(self.training)
+        # scoring loads compiled loops, which a given number of sensors does without
+        from lidardesign.fitting.trials import HeldBackScenes
+
+        return HeldBackScenes(self.training, self.request.planner)
 
     @cached_property
     def pool(self) -> CandidatePool | None:
@@ -218,6 +235,8 @@ class Fitter:
 
     def _to_goal(self) -> FitResult:
         """The design with the least that keeps the goal, as its request gives it without a goal."""
+        from lidardesign.fitting.trials import GoalSearch
+
         request = self.request
         if request.sensors == BEST and request.least != "sensors":
             request = replace(request, sensors=self._best_count())
@@ -240,8 +259,7 @@ class Fitter:
 
     def _without_idle(self, count: int) -> FitResult:
         """The design of at most `count` sensors, fewer while any would fire no ray or rest on too few samples."""
-        bounds = self.request.constraints
-        least = max(bounds.sensors.min or 1, len(bounds.each))
+        least = self.request.constraints.least_sensors
         while count > least:
             try:
                 result = self._fitted(replace(self.request, sensors=count), may_idle=True)
@@ -292,6 +310,8 @@ class Fitter:
         started, constraints, counts = time.perf_counter(), request.constraints, request.counts
         is_chosen = request.layout == "chosen"
         fitted = self._sensors(request, constraints, counts[-1] if is_chosen else request.rays)
+        if constraints.survive:
+            check_several(len(fitted.sensors))
         design = DesignSpec(
             name=request.name,
             sensors=fitted.sensors,
@@ -325,6 +345,11 @@ class Fitter:
                     f"about {chosen.silent:.0%} of the training scenes that were held back, no ray tells anything; "
                     "where that is not expected, check that places, directions and gates are right, and in metres"
                 )
+            if chosen.shared < LEAST_SHARED:
+                notes.append(
+                    f"constraints let several sensors see {chosen.shared:.0%} of what they see together: the rest is "
+                    "lost with its sensor; allow wider fields of view or gates"
+                )
         elif fitted.rays is not None:
             design = replace(design, constraints=merged(design.constraints, {"budget": {"rays": fitted.rays}}))
         result = FitResult.of_fit(design, fitted, self.samples, time.perf_counter() - started)
@@ -332,6 +357,8 @@ class Fitter:
 
     def _best_count(self) -> int:
         """The number of sensors that scores best on training scenes, with a note on those tried."""
+        from lidardesign.fitting.trials import best_of, trials_of
+
         request, metric = self.request, self.request.run.metric
         check_feasible(request.constraints, request.run.config.space, rays=request.rays)
         if not self.is_pooled:
@@ -348,23 +375,15 @@ class Fitter:
         found = ", ".join(f"{one.sensors}: {one.scores.mean():.4g} in {one.mbps:.3g} Mbit/s" for one in trials)
         text = f"sensors: {best.sensors}; {metric.name} [{metric.unit}] on {len(best.scores)} training scenes "
         self.notes(BackgroundNote(f"{text}by their number: {found}"))
+        for line in self.scenes.effects:
+            self.notes(BackgroundNote(line))
         return best.sensors
 
     def _parts(self, request: FitRequest, notes: Notes) -> FitResult:
         from lidardesign.fitting.part_design import choose_parts
 
-        return choose_parts(
-            self.samples,
-            request.constraints,
-            count=request.sensors,
-            rays=request.rays,
-            informs=partial(checked_information, request.run.task),
-            scenes=self.training.scenes,
-            seed=request.seed,
-            name=request.name,
-            notes=notes,
-            progress=self.progress,
-        )
+        informs = partial(checked_information, request.run.task)
+        return choose_parts(self.samples, request, self.training, informs, notes, self.progress)
 
     def _rings(self) -> FitResult:
         from lidardesign.fitting.spinning import CHANNELS, choose_rings
@@ -427,6 +446,8 @@ def twin_without_visibility(
     seed = seed if isinstance(seed, int) else 0
     drawn = twin_samples(run) if samples is None else samples()
     document = {key: value for key, value in design.constraints.items() if key != "parts"}
+    if rays == 1:
+        document.pop("survive", None)
     # a bandwidth is one of evaluations, whatever bits the design was made for
     budget = document.get("budget", {}) if bandwidth_mbps is None else {"bandwidth_mbps": bandwidth_mbps}
     document["budget"] = {**budget, "rays": rays}

@@ -1,36 +1,42 @@
 """Real parts to buy, and where to mount them: `fit --parts`.
 
 Parts are proposed at the mounts, or at places in the box of origins, facing what the density looks at, upright and
-turned. Training scenes that the density was not learned from give their information, and the best few are chosen,
-with a bound on the information of any other set of those proposed.
+turned. Training scenes that the density was not learned from give their information. The best few by it, with a bound
+on the information of any other set of those proposed, and other good sets are judged by the task's own score on scenes
+that were held back, under the detector that is asked for; the best of these is taken.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import partial
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 
 from lidardesign.constraints.document import Constraints, SensorRules
 from lidardesign.constraints.feasibility import BandwidthBudget, check_feasible
 from lidardesign.constraints.origins import inside_excluded, mounts_of, origin_box
-from lidardesign.errors import ConfigError, DataError, InfeasibleError
-from lidardesign.fitting.part_sets import ChosenSet, SetLimits, choose_set
+from lidardesign.errors import BackgroundNote, ConfigError, DataError, InfeasibleError
+from lidardesign.fitting.part_sets import ChosenSet, SetLimits, choose_set, further_sets, value_of
 from lidardesign.fitting.part_shapes import PartBundle, PlacedPart, broken_keys, part_table, parts_inform, shapes_of
-from lidardesign.fitting.request import FitResult
+from lidardesign.fitting.request import FitRequest, FitResult
+from lidardesign.fitting.trials import HeldBackScenes, Trial, best_of
 from lidardesign.mixture.bounds import bounds_of, clip_azimuth
 from lidardesign.mixture.components import Axes
-from lidardesign.numerics import TINY
+from lidardesign.numerics import SLACK, TINY
 from lidardesign.parts.catalogue import named_parts, part_rays, part_sensor
 from lidardesign.parts.part import Part
 from lidardesign.rays import information
 from lidardesign.rays.certificate import certificate_document
-from lidardesign.rays.coverage import Coverage, InformedScene
+from lidardesign.rays.coverage import Coverage
 from lidardesign.rays.selection import are_enough
+from lidardesign.rays.training import CHOICE, HELD_BACK, InformedScene, TrainingScenes
 from lidardesign.run.clock import phase
 from lidardesign.samples import Samples
 from lidardesign.scenes.rays import Rays, Returns
@@ -39,25 +45,38 @@ from lidardesign.sensors.bandwidth import split_budget
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import MOST_FILE_RAYS
 from lidardesign.sensors.pattern import Pattern, low_discrepancy
-from lidardesign.sensors.sensor import DEFAULT_LEVEL, interval_factor
+from lidardesign.sensors.sensor import DEFAULT_LEVEL, Sensor, interval_factor
+from lidardesign.simulate.calibration import reach_notes, with_part_light
+from lidardesign.simulate.detector.physics import IDEAL, Detector, check_windows
 from lidardesign.space import angles, observed_point
-from lidardesign.task import Information, random_generator
+from lidardesign.task import Information, Metric, random_generator
 
+MOST_JUDGED = 8  # sets of a number of parts, by the task's score
 MOST_POSES = 500  # of each kind of part, over all places
 MOST_PLACES = 25  # in a box of origins
 MOST_TOLD = 1_000_000  # candidates times scenes
 
 
+@dataclass(eq=False)
+class SetTrial(Trial):
+    """A set of parts that is tried.
+
+    Arguments:
+        members: The parts, as numbers of candidates.
+        bound: An upper bound of the information of any set of as many.
+        design: Its design.
+    """
+
+    members: tuple[int, ...] = ()
+    bound: float = np.inf
+    design: DesignSpec | None = None
+
+
 def choose_parts(
     samples: Samples,
-    constraints: Constraints,
-    *,
-    count: int,
-    rays: int | None,
+    request: FitRequest,
+    training: TrainingScenes,
     informs: Callable[[Scene, Sequence[Returns]], Information],
-    scenes: Callable[[str], Iterator[Scene]],
-    seed: int,
-    name: str,
     notes: Callable[[str], None],
     progress: Callable[[str], None],
 ) -> FitResult:
@@ -65,13 +84,9 @@ def choose_parts(
 
     Arguments:
         samples: Samples of the density.
-        constraints: The parts and their constraints.
-        count: Largest number of parts.
-        rays: Number of rays; None fires all that they have.
+        request: What is asked for.
+        training: Training scenes, in the world that is asked for.
         informs: The task's information of a scene's returns.
-        scenes: An endless stream of training scenes for a purpose, `choice` or `held back`.
-        seed: Root of the random streams.
-        name: The design's name.
         notes: Called with every note.
         progress: Called with every step.
 
@@ -80,8 +95,8 @@ def choose_parts(
         InfeasibleError: Constraints that contradict each other, or that no part keeps; fewer rays than parts.
         DataError: No part has information about the scenes.
     """
-    started, space, wanted = perf_counter(), samples.space, constraints.parts
-    check_feasible(constraints, space, sensors=count, rays=rays)
+    started, space, constraints, count = perf_counter(), samples.space, request.constraints, request.sensors
+    check_feasible(constraints, space, sensors=request.fewest or count, rays=request.rays)
     if space.conditioned:
         raise ConfigError(
             "the density has conditions",
@@ -89,72 +104,149 @@ def choose_parts(
             allowed="tasks whose sensors do not move",
             hint="fit without parts",
         )
-    every = named_parts(wanted.names, wanted.each)
-    nearest = [part.name for part in every if part.value("near_m") is None]
-    if nearest:
-        left_out = "left out" if wanted.names == "catalog" else "taken as 0"
-        notes(f"no source gives the shortest range of {', '.join(nearest)}: {left_out}")
-    power = [] if wanted.power_w is None else [part.name for part in every if part.value("power_w") is None]
-    if power:
-        notes(f"no source gives the power of {', '.join(power)}: left out, since parts.power_w is bounded")
-    unknown = {*power, *(nearest if wanted.names == "catalog" else ())}
-    every = [part for part in every if part.name not in unknown]
-    if not every:
-        raise InfeasibleError(
-            "no source gives the power of any of the parts",
-            conflicts=["parts.power_w"],
-            hint="leave parts.power_w out, or name parts whose power is known",
-        )
-    placed = proposed(every, constraints, samples, seed)
-    budget = BandwidthBudget.of(constraints, rays)
+    planner = request.planner
+    detector = IDEAL if planner is None else planner.detector
+    placed = _covered(proposed(_known_parts(constraints, notes), constraints, samples, request.seed), detector, notes)
+    budget = BandwidthBudget.of(constraints, request.rays)
     most = (budget.rays or MOST_FILE_RAYS) // count
     limits = _limits(placed, constraints, count, most, budget)
     if not limits.may_join((), len(placed)).any():
-        bounded = {"budget.bandwidth_mbps": budget.limit_mbps, "parts.power_w": wanted.power_w}
+        bounded = {"budget.bandwidth_mbps": budget.limit_mbps, **constraints.parts.sums}
         keys = [key for key, limit in bounded.items() if limit is not None]
         raise InfeasibleError(
             f"each of the parts needs more than {' or '.join(keys)} allows",
             conflicts=keys,
             hint="loosen one of the constraints named, or fire fewer rays",
         )
-    bundle = PartBundle(placed, most, next(scenes("choice")).frames)
-    chosen, coverage, held_back_loss, trained = _chosen_set(bundle, limits, informs, scenes, seed, progress)
-    if len(chosen.members) < count:
-        notes(f"{len(chosen.members)} of {count} parts: no further part tells more or fits the bounds")
-    design = _design(name, constraints, [placed[member] for member in chosen.members], budget.rays)
+    bundle = PartBundle(placed, most, training.first(HELD_BACK)[0].frames, detector)
+    inform = partial(parts_inform, bundle, informs=informs, count=count, seed=request.seed)
+    coverage, chosen, trained = _enough_scenes(bundle, limits, inform, training, progress)
+    numbers = range(request.fewest or count, count + 1)
+
+    def trial(members: tuple[int, ...], bound: float) -> SetTrial:
+        design = _design(request.name, constraints, [placed[member] for member in members], budget.rays)
+        fired = (with_part_light(design.rays(), design, detector),)
+        return SetTrial(len(members), fired, members=members, bound=bound, design=design)
+
+    by_number: list[list[SetTrial]] = []
+    for number in numbers:
+        fewer = replace(limits, count=number)
+        with phase("choice"):
+            best = chosen if number == count else choose_set(coverage, fewer)
+            sets = further_sets(coverage, fewer, best.members, MOST_JUDGED)
+        if number > numbers[0] and len(best.members) < number:
+            break
+        by_number.append([trial(best.members, best.bound)])
+        for members in sets[1:]:
+            with suppress(InfeasibleError):  # fewer rays than are asked for
+                by_number[-1].append(trial(members, best.bound))
+    scenes = HeldBackScenes(training, planner)
+    found = _judged(by_number, scenes, request, notes, progress)
+    rows = [_row(one, placed) for one in found] if request.fewest else []
+    for row in rows:
+        notes(_row_text(row, request.run.metric))
+    sign = 1.0 if request.run.metric.better == "lower" else -1.0
+    winner = min(found, key=lambda one: sign * one.scores[: min(len(one.scores) for one in found)].sum())
+    if len(winner.members) < count and not request.fewest:
+        notes(f"{len(winner.members)} of {count} parts: no further part tells more or fits the bounds")
+    kinds = [placed[member].part for member in winner.members]
+    prices = [part.value("price") for part in kinds]
+    if any(prices):
+        free = ", ".join(dict.fromkeys(part.name for part in kinds if part.value("price") is None))
+        notes(f"the parts cost {sum(filter(None, prices)):.6g} in all{f', without {free}' if free else ''}")
+    for line in reach_notes(winner.design):
+        notes(line)
+    told = part_table(inform(training.first(HELD_BACK), among=winner.members), len(winner.members))
     certificate = certificate_document(
-        rays=design.count or 0,
-        value=coverage.complete - chosen.value,
-        bound=coverage.complete - chosen.bound,
-        held_back_value=held_back_loss,
+        rays=winner.design.count or 0,
+        value=coverage.complete - value_of(coverage, winner.members),
+        bound=coverage.complete - winner.bound,
+        held_back_value=told.loss_of(np.zeros(len(winner.members), dtype=np.intp)),
         candidates=len(placed),
         gates=1,
         scenes=len(trained),
         unit=trained[0].unit,
     )
-    return FitResult.of_choice(replace(design, certificates=(certificate,)), samples, perf_counter() - started)
+    design = replace(winner.design, certificates=(certificate,))
+    return replace(FitResult.of_choice(design, samples, perf_counter() - started), numbers=tuple(rows))
 
 
-def _chosen_set(
+def _known_parts(constraints: Constraints, notes: Callable[[str], None]) -> list[Part]:
+    """The parts that are named, without those whose range, power or price is not known where it has to be.
+
+    Raises:
+        InfeasibleError: None is left.
+    """
+    wanted = constraints.parts
+    every = named_parts(wanted.names, wanted.each)
+    nearest = [part.name for part in every if part.value("near_m") is None]
+    if nearest:
+        left_out = "left out" if wanted.names == "catalog" else "taken as 0"
+        notes(f"no source gives the shortest range of {', '.join(nearest)}: {left_out}")
+    unknown = {*(nearest if wanted.names == "catalog" else ())}
+    for key, (name, _) in wanted.sums.items():
+        lacking = [part.name for part in every if part.value(name) is None]
+        if lacking:
+            figure = name.removesuffix("_w")
+            notes(f"no source gives the {figure} of {', '.join(lacking)}: left out, since {key} is bounded")
+        if unknown.issuperset(part.name for part in every if part.name not in lacking):
+            raise InfeasibleError(
+                f"no source gives the {name.removesuffix('_w')} of any of the parts",
+                conflicts=[key],
+                hint=f"leave {key} out, or name parts for which it is known",
+            )
+        unknown |= {*lacking}
+    return [part for part in every if part.name not in unknown]
+
+
+def _covered(placed: list[PlacedPart], detector: Detector, notes: Callable[[str], None]) -> list[PlacedPart]:
+    """Those parts whose gates the histogram of a detector covers.
+
+    Raises:
+        ConfigError: None.
+    """
+    fails: dict[str, ConfigError] = {}
+    for one in {one.part.name: one for one in placed}.values():
+        try:
+            check_windows(np.array([one.shape.gate_m]), detector)
+        except ConfigError as error:
+            fails[one.part.name] = error
+    kept = [one for one in placed if one.part.name not in fails]
+    if not kept:
+        raise next(iter(fails.values()))
+    if fails:
+        notes(f"{detector.name} does not cover the ranges of {', '.join(fails)}: left out")
+    return kept
+
+
+def _timed(scenes: Iterable[Scene], count: int, label: str, progress: Callable[[str], None]) -> Iterator[Scene]:
+    """Scenes as they come, with the time left for so many of them in a label."""
+    began = perf_counter()
+    for number, scene in enumerate(itertools.islice(scenes, count)):
+        left = f", about {(perf_counter() - began) * (count - number) / number:.0f} s left" if number else ""
+        progress(f"{label}{left}")
+        yield scene
+
+
+def _enough_scenes(
     bundle: PartBundle,
     limits: SetLimits,
-    informs: Callable[[Scene, Sequence[Returns]], Information],
-    scenes: Callable[[str], Iterator[Scene]],
-    seed: int,
+    inform: Callable[..., list[InformedScene]],
+    training: TrainingScenes,
     progress: Callable[[str], None],
-) -> tuple[ChosenSet, Coverage, float, list[InformedScene]]:
-    """The best set, the information of all parts, the set's loss on scenes held back, and the scenes of the choice.
+) -> tuple[Coverage, ChosenSet, list[InformedScene]]:
+    """The information of all parts about enough scenes, the best set by it, and the scenes.
 
     Raises:
         DataError: No part has information about the scenes.
     """
-    inform = partial(parts_inform, bundle, informs=informs, count=limits.count, seed=seed)
-    held_back = list(itertools.islice(scenes("held back"), information.FEW_SCENES))
-    training, wanted, loss = scenes("choice"), information.FEW_SCENES, np.inf
+    held_back, scenes = training.first(HELD_BACK), training.scenes(CHOICE)
+    wanted, loss = information.FEW_SCENES, np.inf
     informed: list[InformedScene] = []
     while True:
-        progress(f"choosing among {len(bundle.placed)} poses of parts on {wanted} training scenes")
-        informed += inform(itertools.islice(training, wanted - len(informed)), first_scene=len(informed))
+        label = f"choosing among {len(bundle.placed)} poses of parts on {wanted} training scenes"
+        further = _timed(scenes, wanted - len(informed), label, progress)
+        informed += inform(further, first_scene=len(informed))
         coverage = part_table(informed, len(bundle.placed))
         with phase("choice"):
             chosen = choose_set(coverage, limits)
@@ -168,8 +260,56 @@ def _chosen_set(
         before, loss = loss, judged.loss_of(np.zeros(len(chosen.members), dtype=np.intp))
         is_large = 2 * wanted > information.MOST_SCENES or 2 * wanted * len(bundle.placed) > MOST_TOLD
         if is_large or are_enough(before, loss, coverage.complete - chosen.value):
-            return chosen, coverage, loss, informed
+            return coverage, chosen, informed
         wanted *= 2
+
+
+def _judged(
+    by_number: Sequence[list[SetTrial]],
+    scenes: HeldBackScenes,
+    request: FitRequest,
+    notes: Callable[[str], None],
+    progress: Callable[[str], None],
+) -> list[SetTrial]:
+    """The best set of each number of parts by the task's score on training scenes that were held back."""
+    trials, metric = [one for sets in by_number for one in sets], request.run.metric
+    if len(trials) == 1 and scenes.planner is None and not request.fewest:
+        return trials
+    # together first: the effects are those that any of the sets calls for
+    for number in range(1, len(scenes.training.first(HELD_BACK)) + 1):
+        began = perf_counter()
+        scenes.score(trials, number)
+        left = (perf_counter() - began) * (len(scenes.training.first(HELD_BACK)) - number)
+        progress(f"judging {len(trials)} sets of parts, about {left:.0f} s left")
+    found = [best_of(sets, scenes, metric, price=None) for sets in by_number]
+    for one, sets in zip(found, by_number, strict=True):
+        text = f"{metric.name} [{metric.unit}] of {len(sets)} sets of {one.sensors} parts on training scenes"
+        values = ", ".join(f"{each.scores[: information.FEW_SCENES].mean():.4g}" for each in sets)
+        notes(BackgroundNote(f"{text}, the best by the proxy first: {values}"))
+    for line in scenes.effects:
+        notes(line)
+    return found
+
+
+def _row(one: SetTrial, placed: Sequence[PlacedPart]) -> dict[str, Any]:
+    """A set as plain values: its parts by name, its score, and its power and price where all are known."""
+    kinds = [placed[member].part for member in one.members]
+    sums = {name: [part.value(name) for part in kinds] for name in ("power_w", "price")}
+    return {
+        "sensors": one.sensors,
+        "parts": dict(Counter(part.name for part in kinds)),
+        "score": float(one.scores.mean()),
+        **{name: None if None in values else sum(values) for name, values in sums.items()},
+    }
+
+
+def _row_text(row: Mapping[str, Any], metric: Metric) -> str:
+    names = ", ".join(f"{number} {name}" for name, number in row["parts"].items())
+    power, price = (
+        f"{word} {'unknown' if row[key] is None else f'{row[key]:.4g}{unit}'}"
+        for word, key, unit in (("power", "power_w", " W"), ("price", "price", ""))
+    )
+    return f"--sensors {row['sensors']}: {names}; {metric.name} {row['score']:.4g} {metric.unit}, {power}, {price}"
 
 
 def _limits(
@@ -191,8 +331,7 @@ def _limits(
     if budget.limit_mbps is not None:
         bits = [budget.model.mbps_of_widths(np.diff(one.shape.gate_m), min(one.part.rays, most_rays)) for one in placed]
         budgets.append((np.array(bits), budget.limit_mbps))
-    if wanted.power_w is not None:
-        budgets.append((np.array([one.part.value("power_w") for one in placed]), wanted.power_w))
+    budgets += [(np.array([one.part.value(name) for one in placed]), bound) for name, bound in wanted.sums.values()]
     return SetLimits(count, kinds, budgets)
 
 
@@ -234,8 +373,19 @@ def proposed(parts: Sequence[Part], constraints: Constraints, samples: Samples, 
             for turn, shape in enumerate(ways):
                 # each way to mount a part has the middle, and its share of the others
                 for aim in (aims[0], *aims[1 + turn :: len(ways)]):
-                    placed.append(PlacedPart(shape, shape.pose(origin, *aim, 0.0, axes), number))
+                    pose = shape.pose(origin, *aim, np.clip(0.0, bounds.roll_low[0], bounds.roll_high[0]), axes)
+                    if _may_roll(part_sensor(shape.part, pose), rules):
+                        placed.append(PlacedPart(shape, pose, number))
+    if not placed:
+        raise InfeasibleError("no part can be mounted at the roll", conflicts=["boresight.roll_deg", "parts"])
     return placed
+
+
+def _may_roll(sensor: Sensor, rules: SensorRules) -> bool:
+    """True where a sensor keeps the bounds on its roll."""
+    low, high = rules.boresight.roll_deg.min, rules.boresight.roll_deg.max
+    roll = np.degrees(sensor.roll_rad)
+    return (low is None or roll >= low - SLACK) and (high is None or roll <= high + SLACK)
 
 
 def _places(rules: SensorRules, samples: Samples, generator: np.random.Generator) -> np.ndarray:

@@ -25,6 +25,8 @@ from lidardesign.rays.coverage import Coverage
 
 FEW_SETS = 100_000  # are searched through, whatever it takes
 MOST_WORK = 1e9  # entries of the table that a search of more sets may read: some seconds
+STARTS = (8, 4, 2)  # a set is begun at the last candidate of the best eighth of its kind, ...
+MOST_KINDS = 6  # that further sets are sought of, those that tell most by themselves
 MOST_LEAVING = 2  # members of a set that are exchanged at once
 
 
@@ -83,7 +85,7 @@ def choose_set(coverage: Coverage, limits: SetLimits) -> ChosenSet:
     """
     rows = np.arange(coverage.shape[0])
     best = _improved(coverage, limits)
-    value, bound = _value(coverage, best), np.inf
+    value, bound = value_of(coverage, best), np.inf
     while len(rows):
         left, allowed = _restrict(coverage, rows), limits.of(rows)
         if math.comb(len(rows), min(limits.count, len(rows))) > FEW_SETS:
@@ -96,9 +98,51 @@ def choose_set(coverage: Coverage, limits: SetLimits) -> ChosenSet:
             rows, left, allowed = rows[kept], _restrict(left, np.flatnonzero(kept)), allowed.of(np.flatnonzero(kept))
         found, is_complete = _searched(left, allowed, value)
         if found:
-            best, value = tuple(int(row) for row in rows[list(found)]), _value(left, found)
+            best, value = tuple(int(row) for row in rows[list(found)]), value_of(left, found)
         return ChosenSet(best, value, value if is_complete else max(bound, value))
     return ChosenSet(best, value, value)
+
+
+def further_sets(coverage: Coverage, limits: SetLimits, chosen: Sequence[int], most: int) -> list[tuple[int, ...]]:
+    """A set and the best others of each way to fill one greedily, distinct, those of one kind first.
+
+    The ways: one kind alone, a kind in the place of a member's, and from several candidates of each kind and place.
+
+    Arguments:
+        coverage: The information of each candidate.
+        limits: The admissible sets; the first of their kinds is kept, one by one.
+        chosen: The set.
+        most: The largest number of sets.
+    """
+    (kind, allowed), *others = limits.kinds
+    single = np.where(limits.may_join((), len(kind)), coverage.gains(np.zeros(len(coverage.weight)))[:, 0], 0.0)
+    order = np.argsort(-single, kind="stable")
+    order = order[single[order] > 0]
+    _, first = np.unique(kind[order], return_index=True)
+    present = kind[order[np.sort(first)]][:MOST_KINDS]
+
+    def filled(counts: np.ndarray) -> tuple[int, ...]:
+        own = SetLimits(limits.count, [(kind, np.minimum(counts, allowed)), *others], limits.budgets)
+        return _filled(coverage, own, ())
+
+    alone = [filled(limits.count * np.eye(len(allowed), dtype=np.intp)[one]) for one in present]
+    used = np.bincount(kind[list(chosen)], minlength=len(allowed))
+    swaps = itertools.product(np.flatnonzero(used), present)
+    exchanged = [
+        filled(used - np.eye(len(used), dtype=np.intp)[out] + np.eye(len(used), dtype=np.intp)[into])
+        for out, into in swaps
+        if out != into
+    ]
+    of_kinds = [order[kind[order] == one] for one in present]
+    firsts = [int(rows[len(rows) // part]) for rows in of_kinds for part in (len(rows) + 1, *STARTS)]
+    firsts += [int(order[first]) for own, _ in others for first in np.unique(own[order], return_index=True)[1]]
+    started = [_filled(coverage, limits, (first,)) for first in firsts]
+    found = {tuple(sorted(chosen)): tuple(chosen)}
+    for group, room in ((alone, (most + 1) // 2), (exchanged + started, most)):
+        for one in sorted(group, key=lambda members: -value_of(coverage, members)):
+            if len(found) < min(room, most):
+                found.setdefault(tuple(sorted(one)), one)
+    return list(found.values())
 
 
 def _restrict(coverage: Coverage, rows: np.ndarray) -> Coverage:
@@ -112,7 +156,8 @@ def _known(coverage: Coverage, chosen: Sequence[int]) -> np.ndarray:
     return coverage.known(gate)
 
 
-def _value(coverage: Coverage, chosen: Sequence[int]) -> float:
+def value_of(coverage: Coverage, chosen: Sequence[int]) -> float:
+    """F of a set."""
     return float(coverage.weight @ coverage.counted(_known(coverage, chosen)))
 
 
@@ -131,13 +176,13 @@ def _filled(coverage: Coverage, limits: SetLimits, chosen: Sequence[int]) -> tup
 def _improved(coverage: Coverage, limits: SetLimits) -> tuple[int, ...]:
     """The greedy set, members exchanged until no exchange gains."""
     best = _filled(coverage, limits, ())
-    value, is_better = _value(coverage, best), True
+    value, is_better = value_of(coverage, best), True
     while is_better:
         is_better = False
         for leaving in range(1, MOST_LEAVING + 1):
             for rest in itertools.combinations(best, max(len(best) - leaving, 0)):
                 tried = _filled(coverage, limits, rest)
-                if (found := _value(coverage, tried)) > value * (1 + SLACK):
+                if (found := value_of(coverage, tried)) > value * (1 + SLACK):
                     best, value, is_better = tried, found, True
                     break
             if is_better:

@@ -10,10 +10,14 @@ directions are binned in cells of a sphere, each cell is cast once from each pla
 pose is that of the cells of its rays, inside its own gate. Of dense patterns an even subset is used, and of many items
 a random draw. Cells are as small as the number of rays to be cast allows. The cell's ray is that of one of the parts,
 so that patterns in a plane stay in it.
+
+Under a detector with wide beams a zone is what it is: a few thin beams over the part's own angles, whose light the
+detector merges into one return. Parts with the same angle share such rays, in cells of a quarter of it at least.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -29,12 +33,14 @@ from lidardesign.parts.part import Part, to_angles, to_directions
 from lidardesign.rays import kernels
 from lidardesign.rays.coverage import Coverage, gather
 from lidardesign.rays.information import choosing
-from lidardesign.rays.training import InformedScene, inform
+from lidardesign.rays.training import InformedScene
 from lidardesign.run.clock import phase
 from lidardesign.scenes.rays import Rays, Returns
 from lidardesign.scenes.scene import Scene
 from lidardesign.sensors.pattern import even_subset
 from lidardesign.sensors.sensor import boresight_frame, boresight_of
+from lidardesign.simulate.detector.physics import Detector, Physics
+from lidardesign.simulate.returns import build_casters, simulate_many
 from lidardesign.space import RANGE, DesignSpace, angles
 from lidardesign.task import Information, random_generator
 
@@ -46,6 +52,10 @@ MOST_MEMBERS = 20_000_000  # rays kept of all parts' patterns
 MOST_ITEMS = 60  # of a scene: the choice of a few parts needs few
 SIZED = 10  # one part in so many is used for the first size of cells
 COARSE_CELL_RAD = math.radians(3.0)  # from which the size of cells is found
+LEAST_BEAM_RAD = 0.01  # narrower beams count as lines
+CELLS_PER_BEAM = 4  # along its width, at most
+BEAM_RAYS = 4  # of a wide beam
+MOST_PER_BEAM = 1 << 48  # larger than the number of any place and cell
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,16 +166,21 @@ class PartBundle:
         placed: The parts.
         most_rays: The largest number of rays of each, an even subset of its pattern.
         frames: Number of casts in a scene.
+        detector: The detector; beams are lines where it has no wide ones, or there is none.
 
     `rays` are to be cast; those of part i are `members[first[i]:first[i + 1]]`, some more than once. Of them a part
-    has `usual_rays` in the middle.
+    has `usual_rays` in the middle. Beams are the same between `ends`, each with its `physics`.
     """
 
-    def __init__(self, placed: Sequence[PlacedPart], most_rays: int, frames: int) -> None:
+    def __init__(
+        self, placed: Sequence[PlacedPart], most_rays: int, frames: int, detector: Detector | None = None
+    ) -> None:
         self.placed, self.most_rays = placed, most_rays
+        self.is_wide = detector is not None and detector.footprint_rays > 1 and detector.divergence_rad > 0
+        self._beams = sorted({self._beam(one) for one in placed})
         self.most_pattern = min(most_rays, max(MOST_MEMBERS // len(placed), 1))
         self._patterns: dict[str, np.ndarray] = {}
-        size_rad, most = COARSE_CELL_RAD, min(MOST_CAST, MOST_CASTS // frames)
+        size_rad, most = COARSE_CELL_RAD, min(MOST_CAST, MOST_CASTS // frames // (BEAM_RAYS if self.is_wide else 1))
         size_rad *= math.sqrt(len(np.unique(np.concatenate(self._keys(placed[::SIZED], size_rad)))) / most)
         while True:
             keys = self._keys(placed, size_rad)
@@ -183,8 +198,29 @@ class PartBundle:
             origin[own] = placed[part].pose.origin_m
             looking[own] = self._looking(placed[part])[index[own] - self.first[part]]
         gate_m = (min(one.shape.gate_m[0] for one in placed), max(one.shape.gate_m[1] for one in placed))
-        count = len(cast)
+        count, widths = len(cast), [(beam, detector) for beam in self._beams]
+        self.ends = np.searchsorted(cast, MOST_PER_BEAM * np.arange(len(widths) + 1))
+        self.physics = [_wide_beams(*one) if one[0] else None for one in widths]
         self.rays = Rays(origin, looking, np.tile(gate_m, (count, 1)), np.zeros(count, dtype=np.intp), np.zeros(count))
+
+    def returns(self, scene: Scene) -> list[Returns]:
+        """The returns of the rays in a scene, one entry per frame."""
+        casters = build_casters(scene)
+        groups = [self.rays.subset(slice(*pair)) for pair in itertools.pairwise(self.ends)]
+        every = [
+            simulate_many(scene, [rays], casters=casters, physics=physics)[0]
+            for rays, physics in zip(groups, self.physics, strict=True)
+        ]
+        joined = [
+            [np.concatenate([getattr(one, name) for one in frames]) for name in ("outcome", "range_m", "body")]
+            for frames in zip(*every, strict=True)
+        ]
+        return [Returns(self.rays, *columns, frame=frame) for frame, columns in enumerate(joined)]
+
+    def _beam(self, placed: PlacedPart) -> float:
+        """The angle of a part's beams; 0: lines."""
+        beam = placed.part.beam_rad
+        return beam if self.is_wide and beam >= LEAST_BEAM_RAD else 0.0
 
     def _looking(self, placed: PlacedPart) -> np.ndarray:
         part = placed.part
@@ -197,9 +233,16 @@ class PartBundle:
         """A number for the cell and place of each ray, by part."""
         keys = []
         for one in placed:
-            cell, cells = cells_of(self._looking(one), size_rad)
-            keys.append(one.place * cells + cell)
+            beam = self._beam(one)
+            cell, cells = cells_of(self._looking(one), max(size_rad, beam / CELLS_PER_BEAM))
+            keys.append(self._beams.index(beam) * MOST_PER_BEAM + one.place * cells + cell)
         return keys
+
+
+def _wide_beams(beam_rad: float, detector: Detector) -> Physics:
+    """Beams of an angle, whose light a detector merges into returns."""
+    wide = replace(detector, divergence_rad=beam_rad, footprint_rays=BEAM_RAYS, bins=None)
+    return Physics(wide, frozenset({"footprint"}))
 
 
 @phase("what returns tell")
@@ -235,7 +278,8 @@ def parts_inform(
     share, told = min(count * bundle.usual_rays / len(rays), 1.0), []
     for number, scene in enumerate(scenes, first_scene):
         with choosing(share):
-            informed = inform(scene, rays, [slice(0, len(rays))], informs)
+            returns = bundle.returns(scene)
+            informed = InformedScene.of(informs(scene, returns), returns)
         informed = _fewer_items(informed, random_generator(seed, "items of parts", number))
         order = np.argsort(informed.ray, kind="stable")
         start = np.concatenate([[0], np.cumsum(np.bincount(informed.ray, minlength=len(rays)))])

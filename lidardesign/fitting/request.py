@@ -36,9 +36,11 @@ from lidardesign.sensors.design import FITTED_LAYOUTS, DesignSpec, Gates, Layout
 from lidardesign.sensors.pattern import TRAVELLED
 from lidardesign.sensors.sensor import LEVELS, MOST_RAYS
 from lidardesign.space import DIMENSIONS, DesignSpace
+from lidardesign.task import Task
 
 if TYPE_CHECKING:
     from lidardesign.density.objective.target import Target
+    from lidardesign.simulate.plan import Planner
 
 BEST = "best"  # as many sensors as score best on training scenes
 COUNTS = (1, 2, 3, 4, 6, 8)  # of sensors, that are tried for that
@@ -50,6 +52,7 @@ NAME_PATTERN = re.compile(r"[^\W.][\w.+-]{0,99}")
 PLACE_KEYS = ("origin_m", "origin_box_m")
 # In the provenance of designs, and what to do where it cannot be understood.
 KEY = "weighting"
+WORLD = "world"
 FIT_AGAIN = "fit the design again: an earlier version refined it, or its file was changed by hand"
 
 
@@ -58,7 +61,8 @@ class FitOptions:
     """A user's choices for a fit; defaults follow from an earlier design, the constraints or the task.
 
     Arguments:
-        sensors: Number of sensors, or "best": as many as score best on training scenes.
+        sensors: Number of sensors, or "best": as many as score best on training scenes; of parts also "1-4": as
+            "best", with a table of these numbers.
         constraints: Constraints, a mapping of them, or a YAML file of them.
         layout: chosen, even or spinning.
         rays: Rays per frame over all sensors.
@@ -72,6 +76,9 @@ class FitOptions:
         name: The design's name.
         seed: Seed of all random numbers; the run's by default.
         certify: Whether every number of rays gets a certificate, not the middle one alone.
+        detector: The detector under which designs that are tried are judged: a name, or its file; ideal by default.
+        settings: Settings of the task for the scenes that designs are chosen and judged in.
+        survive: 1: rays are chosen for the loss of any one sensor, too; by default as constraints say.
         goal: The score that the design has to keep on training scenes that were held back, in the metric's unit.
         least: What it then has the least of: bandwidth, rays, sensors or parts.
 
@@ -93,6 +100,9 @@ class FitOptions:
     name: str | None = None
     seed: int | None = None
     certify: bool = False
+    detector: Path | str | None = None
+    settings: Sequence[str] | Mapping[str, Any] = ()
+    survive: int | None = None
     goal: float | None = None
     least: str | None = None
 
@@ -106,15 +116,23 @@ class FitOptions:
             check_choice(self.gates, "--gates", get_args(Gates))
         if self.least is not None:
             check_choice(self.least, "--least", LEAST)
-        if self.sensors not in (None, BEST, *range(1, MOST_FITTED + 1)):
-            allowed = f"a whole number from 1 to {MOST_FITTED}, or best"
+        if self.sensors not in (None, BEST, *range(1, MOST_FITTED + 1)) and not self.numbers:
+            allowed = f"a whole number from 1 to {MOST_FITTED}, best, or with parts numbers such as 1-4"
             raise ConfigError(repr(self.sensors), where="--sensors", allowed=allowed)
         limits = {"rays": (1, MOST_RAYS), "channels": (1, MOST_FITTED), "seed": (0, MAX_SEED)}
+        limits["survive"] = (0, 1)
         for name, (low, high) in limits.items():
             if getattr(self, name) is not None:
                 check_number(getattr(self, name), f"--{name}", low, high, whole=True)
         if self.level is not None:
             check_number(self.level, "--level", *LEVELS)
+
+    @property
+    def numbers(self) -> range | None:
+        """The numbers of sensors of a text such as 1-4; None where there is a single one."""
+        found = re.fullmatch(r"(\d{1,4})-(\d{1,4})", self.sensors) if isinstance(self.sensors, str) else None
+        low, high = (int(text) for text in found.groups()) if found else (0, 0)
+        return range(low, high + 1) if 1 <= low < high <= MOST_FITTED else None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -128,7 +146,8 @@ class FitRequest:
         constraints: The constraints, without any key where the design is free.
         is_constrained: Whether constraints were given, which the design is then checked against.
         at: Condition values that the design is for; without any, one for all of them.
-        sensors: How many sensors, or "best"; None where constraints say so.
+        sensors: How many sensors, or "best"; None where constraints say so. Of parts the largest number.
+        fewest: The least number of parts that is tried; None: the largest alone.
         layout: The layout of rays.
         rays: Rays per frame; None takes the task's numbers, or leaves them open.
         gates: Whether chosen rays have their sensor's gate or their own.
@@ -137,6 +156,8 @@ class FitRequest:
         channels: Rings of each sensor that spins.
         names: Names of the sensors, where there are as many; none numbers them.
         certify: Whether every number of rays gets a certificate.
+        detector: The detector under which designs are judged, by name or file; None: they are in an ideal world.
+        settings: Settings of the task for the scenes that designs are chosen and judged in.
         goal: The score that it has to keep, with the least of `least`; None leaves nothing to be sought.
         least: One of `LEAST`.
     """
@@ -156,6 +177,9 @@ class FitRequest:
     channels: int | None
     names: Sequence[str]
     certify: bool
+    detector: str | None = None
+    settings: tuple[str, ...] = ()
+    fewest: int | None = None
     goal: float | None = None
     least: str = LEAST[0]
 
@@ -186,12 +210,19 @@ class FitRequest:
         asked = load_constraints(options.constraints, notes=notes)
         if asked is None and base is not None:
             asked = Constraints()
-        constraints, names = _with_rig(options, _with_parts(options, asked, run), run, notes)
+        constraints, names = _with_rig(options, _with_survival(options, _with_parts(options, asked, run)), run, notes)
         rules, moved = snap_to_space(constraints or Constraints(), run.config.space)
         for note in moved:
             notes(note)
         layout = _layout(rules, base, run, options)
         _check_layout(layout, rules, run, options)
+        if options.numbers and (rules.parts is None or options.goal is not None):
+            fault = "together with a goal" if rules.parts else "without parts"
+            raise ConfigError(f"several numbers of sensors {fault}", where="--sensors", allowed=f"N, or {BEST}")
+        sensors = _sensors(options.numbers[-1] if options.numbers else options.sensors, rules, base, layout)
+        most = sensors if isinstance(sensors, int) else rules.sensors.max or math.inf
+        if rules.survive:
+            check_several(most)
         _check_goal(layout, rules, run, options)
         at = {**(base.at if base else {}), **options.at}
         space = run.config.space.at(at)
@@ -200,6 +231,16 @@ class FitRequest:
         weighting = _weighting(settings_texts(options.weights), base)
         if weighting.settings:
             with_task_settings(run.task, run.config, weighting.settings, option=weighting.origin)
+        detector, settings = _world(options, base)
+        if settings:
+            with_task_settings(run.task, run.config, settings)
+        if detector is not None:
+            # it loads what simulates light, which fits in an ideal world do without
+            from lidardesign.simulate.detector.files import load_detector
+
+            load_detector(detector)
+            if rules.parts is None and (layout == "spinning" or (sensors != BEST and options.goal is None)):
+                notes(f"{detector} judges sets of parts and numbers of sensors, and none are tried here")
         channels = options.channels
         if layout == "spinning" and channels is None and base is not None:
             channels = base.provenance.get("channels")
@@ -210,7 +251,7 @@ class FitRequest:
             constraints=rules,
             is_constrained=constraints is not None,
             at=at,
-            sensors=_sensors(options.sensors, rules, base, layout),
+            sensors=sensors,
             layout=layout,
             rays=_rays(options.rays, rules, base),
             gates=_gates(options.gates, base, space, layout),
@@ -219,9 +260,29 @@ class FitRequest:
             channels=channels,
             names=names,
             certify=options.certify,
+            detector=detector,
+            settings=settings,
+            fewest=None if options.numbers is None else options.numbers[0],
             goal=options.goal,
             least=options.least or ("bandwidth" if rules.parts is None else "parts"),
         )
+
+    @property
+    def planner(self) -> Planner | None:
+        """The detector, and the effects that matter to the metric; None without a detector."""
+        if self.detector is None:
+            return None
+        from lidardesign.simulate.detector.files import load_detector
+        from lidardesign.simulate.plan import Planner
+
+        planner = Planner(load_detector(self.detector))
+        return replace(planner, tolerance=planner.tolerated.within(self.run.metric))
+
+    @property
+    def world(self) -> dict[str, Any]:
+        """The detector and settings that designs were judged by, as plain values for a design's provenance."""
+        detector = {} if self.detector is None else {"detector": self.detector}
+        return {**detector, **({"set": list(self.settings)} if self.settings else {})}
 
     @property
     def command(self) -> str:
@@ -293,12 +354,16 @@ def _check_layout(layout: LayoutName, constraints: Constraints, run: RunFolder, 
             allowed="tasks with informs",
             hint="--layout even, or give the task a method informs(scene, returns)",
         )
+    place = f"the layout {layout}" if constraints.parts is None else "a design of real parts"
     faults = {
         (f"{options.channels} channels in the layout {layout}", "--channels", "--layout spinning"): (
             options.channels is not None and layout != "spinning"
         ),
         (f"a gate per ray in the layout {layout}", "--gates", "--layout chosen"): (
             options.gates == "ray" and layout != "chosen" and constraints.parts is None
+        ),
+        (f"sensors that may fail in {place}", "survive", "--layout chosen, without parts"): (
+            bool(constraints.survive) and place != "the layout chosen"
         ),
         ("spinning sensors with --at or --weight", "--layout", "chosen, even"): (
             layout == "spinning" and (bool(options.at) or bool(options.weights))
@@ -396,7 +461,9 @@ def _with_parts(options: FitOptions, asked: Constraints | None, run: RunFolder) 
 
     named_parts(asked.parts.names, asked.parts.each)
     lacking = {
-        "the number of parts is missing": not isinstance(options.sensors, int) and asked.parts.count is None,
+        "the number of parts is missing": not isinstance(options.sensors, int)
+        and not options.numbers
+        and asked.parts.count is None,
         "parts together with --at or --weight": options.at or options.weights,
         "parts together with each, which bounds single sensors": asked.each,
         f"parts in the layout {options.layout}": options.layout,
@@ -409,6 +476,26 @@ def _with_parts(options: FitOptions, asked: Constraints | None, run: RunFolder) 
                 fault, where="--parts", allowed="--parts NAME,NAME --sensors N, or parts.names, parts.count"
             )
     return asked
+
+
+def _with_survival(options: FitOptions, asked: Constraints | None) -> Constraints | None:
+    """The constraints with the user's word on sensors that may fail."""
+    if options.survive is None or (asked is None and not options.survive):
+        return asked
+    document = {} if asked is None else asked.as_document()
+    return Constraints.from_mapping({**document, "survive": options.survive})
+
+
+def check_several(sensors: float) -> None:
+    """Refuse a single sensor that may fail.
+
+    Raises:
+        ConfigError: Fewer than two sensors.
+    """
+    if sensors < 2:
+        raise ConfigError(
+            "a single sensor that may fail", where="survive", allowed="2 sensors or more", hint="--sensors 2"
+        )
 
 
 def _sensors(
@@ -459,6 +546,28 @@ def _weighting(settings: tuple[str, ...], base: DesignSpec | None) -> Weighting:
     return Weighting(settings) if settings or base is None else Weighting.of(base)
 
 
+def _world(options: FitOptions, base: DesignSpec | None) -> tuple[str | None, tuple[str, ...]]:
+    """The user's detector and settings of scenes, each else as for the design.
+
+    Raises:
+        ConfigError: Those of the design cannot be read.
+    """
+    known = {} if base is None else base.provenance.get(WORLD, {})
+    if not isinstance(known, Mapping) or not isinstance(known.get("set", []), list | tuple):
+        raise ConfigError(f"holds {known!r}", where=f"{WORLD} of design {base.name}", hint=FIT_AGAIN)
+    detector = known.get("detector") if options.detector is None else options.detector
+    settings = settings_texts(options.settings) or tuple(map(str, known.get("set", [])))
+    return None if detector is None else str(detector), settings
+
+
+def split_settings(overrides: Sequence[str], task: Task) -> tuple[list[str], list[str]]:
+    """Texts KEY=VALUE that are constraints, and those whose first key is no section of these but a task's own."""
+    firsts = [str(parse_override(text).path[0]) for text in overrides]
+    own = {key for key in firsts if key in task.Config.model_fields and key not in Constraints.model_fields}
+    texts = list(zip(firsts, overrides, strict=True))
+    return [text for key, text in texts if key not in own], [text for key, text in texts if key in own]
+
+
 def load_constraints(
     given: Constraints | Mapping[str, Any] | Path | str | None, overrides: Sequence[str] = (), notes: Notes = log_note
 ) -> Constraints | None:
@@ -502,6 +611,7 @@ class FitResult:
         seconds: Wall time [s].
         constraints: The independent checks.
         notes: Lines on sensors.
+        numbers: By number of parts, where several were asked for: their names, score, power and price.
         error_estimates: Standard errors of log_likelihood, ess and admissible_mass.
         goal: For a goal, what was tried, as plain values.
     """
@@ -513,6 +623,7 @@ class FitResult:
     seconds: float
     constraints: tuple[ConstraintCheck, ...] = ()
     notes: tuple[str, ...] = ()
+    numbers: tuple[Mapping[str, Any], ...] = ()
     error_estimates: Mapping[str, Estimate] = field(default_factory=dict)
     goal: Mapping[str, Any] | None = None
 
@@ -546,6 +657,7 @@ class FitResult:
             "constraints": [check.as_dict() for check in self.constraints],
             "seconds": self.seconds,
             "error_estimates": as_documents(self.error_estimates),
+            **({"numbers": [dict(row) for row in self.numbers]} if self.numbers else {}),
             **({} if self.goal is None else {"goal": dict(self.goal)}),
         }
 

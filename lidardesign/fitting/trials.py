@@ -20,14 +20,13 @@ from lidardesign.fitting.request import FitRequest
 from lidardesign.rays.information import FEW_SCENES, MOST_SCENES
 from lidardesign.rays.selection import SHARE_PER_BANDWIDTH
 from lidardesign.rays.training import HELD_BACK, TrainingScenes
-from lidardesign.run.clock import phase
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Scene, group_numbers
-from lidardesign.scoring.scene_scores import score_lists
+from lidardesign.scoring.scene_scores import score_lists, without_each
 from lidardesign.scoring.statistics import Interval, mean_interval
 from lidardesign.sensors.bandwidth import Bandwidth, mean_mbps
 from lidardesign.sensors.design import DesignSpec
-from lidardesign.simulate.plan import Planner
+from lidardesign.simulate.plan import Decision, EffectPlan, Planner
 from lidardesign.simulate.returns import build_casters
 from lidardesign.task import Metric
 
@@ -44,12 +43,19 @@ class Trial:
     Arguments:
         sensors: Its number of sensors.
         fired: Its rays at each value of a condition.
+        survives: Whether the mean score over the loss of each sensor counts as much as that of all sensors.
         scores: Its score on each scene so far.
     """
 
     sensors: int
     fired: tuple[Rays, ...]
+    survives: bool = False
     scores: np.ndarray = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def lists(self) -> list[tuple[Rays, ...]]:
+        """What is scored: all its rays and, where losses count, those that are left by the loss of each sensor."""
+        return [self.fired, *(without_each(self.fired, self.sensors) if self.survives else [])]
 
     @property
     def mbps(self) -> float:
@@ -68,40 +74,58 @@ class HeldBackScenes:
 
     Arguments:
         training: The scenes.
-        planner: The detector; effects are chosen once, on the first scene.
+        planner: The detector; effects are chosen once, on the first scene for what is scored there.
     """
 
     def __init__(self, training: TrainingScenes, planner: Planner | None = None) -> None:
         self.training, self.planner = training, planner
         self.scenes: list[Scene] = []
-        self._physics = None
+        self.plan: EffectPlan | None = None
 
     @property
     def groups(self) -> np.ndarray:
         """The group of each scene so far."""
         return group_numbers(self.scenes)
 
-    @phase("trials")
     def score(self, trials: Sequence[Trial], count: int) -> None:
-        """Score trials, which were scored on equally many scenes, on as many further ones as are missing to `count`."""
-        run, known, drawn = self.training.run, len(trials[0].scores), len(self.scenes)
+        """Score trials on the scenes up to `count` that each was not scored on yet."""
+        run, known = self.training.run, len(self.scenes)
         few = self.training.first(HELD_BACK)
-        if count > drawn:
-            self.scenes += (
-                few[drawn:count]
-                if count <= len(few)
-                else itertools.islice(self.training.scenes(HELD_BACK, drawn), count - drawn)
-            )
-        rows = []
-        for scene in self.scenes[known:count]:
-            casters, fired = build_casters(scene), [trial.fired for trial in trials]
-            if self.planner is not None and not drawn and not rows:
-                plan = self.planner.plan(scene, [rays for one in fired for rays in one], casters)
-                self._physics = self.planner.physics(plan, self.training.seed)
-            found = score_lists(run.task, run.metric, scene, fired, casters, self._physics)
-            rows.append([score.value for score, _ in found])
-        for trial, column in zip(trials, np.array(rows).T, strict=True):
-            trial.scores = np.append(trial.scores, column)
+        self.scenes += (
+            few[known:count]
+            if count <= len(few)
+            else itertools.islice(self.training.scenes(HELD_BACK, known), max(count - known, 0))
+        )
+        for number in range(min(len(trial.scores) for trial in trials), count):
+            scene, missing = self.scenes[number], [trial for trial in trials if len(trial.scores) <= number]
+            casters, lists, physics = build_casters(scene), [trial.lists for trial in missing], None
+            if self.planner is not None:
+                if self.plan is None:
+                    plan = self.planner.plan(scene, [rays for trial in missing for rays in trial.fired], casters)
+                    self.plan = replace(plan, decisions=tuple(map(_affordable, plan.decisions)))
+                physics = self.planner.physics(self.plan, self.training.seed)
+            jobs = list(itertools.chain(*lists))
+            found = iter(score_lists(run.task, run.metric, scene, jobs, casters, physics))
+            for trial, own in zip(missing, lists, strict=True):
+                values = [next(found)[0].value for _ in own]
+                trial.scores = np.append(trial.scores, (values[0] + np.mean(values[1:] or values)) / 2)
+
+    @property
+    def effects(self) -> list[str]:
+        """A line on the effects that were simulated and what skipped ones could change; none without a detector."""
+        if self.plan is None:
+            return []
+        skipped = [one.bound for one in self.plan.decisions if not one.on]
+        range_m, lost = sum(one.range_m for one in skipped), min(sum(one.lost for one in skipped), 1.0)
+        return [
+            f"judged under {self.planner.detector.name} with {', '.join(sorted(self.plan.effects)) or 'no effects'}; "
+            f"the skipped ones could change ranges by {1000 * range_m:.3g} mm and {lost:.2%} of the returns at most"
+        ]
+
+
+def _affordable(decision: Decision) -> Decision:
+    """An effect that takes a thousand times as long as others is left out; the bound of what it changes is kept."""
+    return replace(decision, on=decision.on and decision.name != "multipath")
 
 
 def trials_of(request: FitRequest, fit: Callable[[FitRequest], DesignSpec], counts: Sequence[int]) -> list[Trial]:
@@ -125,6 +149,7 @@ def trials_of(request: FitRequest, fit: Callable[[FitRequest], DesignSpec], coun
             refused = refused or error
             continue
         trials.append(trial_of(request, design, rays))
+        trials[-1].survives = request.constraints.survive > 0
     if not trials and refused is not None:
         raise refused
     return trials
@@ -133,8 +158,7 @@ def trials_of(request: FitRequest, fit: Callable[[FitRequest], DesignSpec], coun
 def allowed_counts(constraints: Constraints, counts: Sequence[int]) -> list[int]:
     """Those of some numbers of sensors that constraints allow, or the least that they allow."""
     bounds = constraints.sensors
-    low = max(bounds.count or bounds.min or 1, len(constraints.each))
-    high = bounds.count or bounds.max or math.inf
+    low, high = bounds.count or constraints.least_sensors, bounds.count or bounds.max or math.inf
     return [count for count in counts if low <= count <= high] or [low]
 
 
@@ -142,33 +166,50 @@ def trial_of(request: FitRequest, design: DesignSpec, rays: int | None) -> Trial
     """A design with so many rays, or its own, wherever the request's sensors are."""
     run = request.run
     conditions = [{**request.at, **one} for one in run.conditions(run.config.space.at(request.at))]
-    return Trial(len(design.sensors), tuple(design.rays(rays, at=at or None) for at in conditions))
+    fired = tuple(design.rays(rays, at=at or None) for at in conditions)
+    if request.planner is not None:
+        from lidardesign.simulate.calibration import with_part_light
+
+        fired = tuple(with_part_light(one, design, request.planner.detector) for one in fired)
+    return Trial(len(design.sensors), fired)
 
 
-def best_of(trials: Sequence[Trial], scenes: HeldBackScenes, metric: Metric) -> Trial:
-    """The fewest sensors that are no worse than the best by more than the standard error of the difference.
+def best_of(
+    trials: Sequence[Trial], scenes: HeldBackScenes, metric: Metric, price: float | None = SHARE_PER_BANDWIDTH
+) -> Trial:
+    """The first trial that is no worse than the best by more than the standard error of the difference.
 
-    Bandwidth costs what it does in a choice of rays: ten percent more of it must bring two percent of the best score,
-    or of its distance from the worst value, whichever is less. Trials that are worse than the best beyond doubt, by
-    two standard errors, are scored on no more scenes.
+    Trials that are worse than the best beyond doubt, by two standard errors, are scored on no more scenes.
+
+    Arguments:
+        trials: By ascending number of sensors.
+        scenes: The scenes.
+        metric: The metric of their scores.
+        price: The price of bandwidth, as in a choice of rays: ten percent more of it must bring two percent of the best
+            score, or of its distance from the worst value, whichever is less. None: bandwidth is free, and the best by
+            the mean is taken.
     """
     scenes.score(trials, FEW_SCENES)
     while True:
-        lost, errors, scale = _losses(trials, scenes.groups, metric)
+        count = len(trials[0].scores)
+        lost, errors, scale = _losses(trials, scenes.groups[:count], metric, price or 0.0)
         open_trials = [trial for trial, mean, error in zip(trials, lost, errors, strict=True) if mean <= 2 * error]
         is_clear = errors[lost <= 2 * errors].max() <= CLEAR_SHARE * scale
-        if len(open_trials) == 1 or is_clear or 2 * len(scenes.scenes) > MOST_SCENES:
-            return next(trial for trial, mean, error in zip(trials, lost, errors, strict=True) if mean <= error)
+        if len(open_trials) == 1 or is_clear or 2 * count > MOST_SCENES:
+            allowed = 0 * errors if price is None else errors
+            return next(trial for trial, mean, error in zip(trials, lost, allowed, strict=True) if mean <= error)
         trials = open_trials
-        scenes.score(trials, 2 * len(scenes.scenes))
+        scenes.score(trials, 2 * count)
 
 
-def _losses(trials: Sequence[Trial], groups: np.ndarray, metric: Metric) -> tuple[np.ndarray, np.ndarray, float]:
+def _losses(
+    trials: Sequence[Trial], groups: np.ndarray, metric: Metric, price: float
+) -> tuple[np.ndarray, np.ndarray, float]:
     """By how much each trial is worse than the best, with standard errors, and the scale of what matters."""
     sign = 1.0 if metric.better == "lower" else -1.0
     score = sign * min(sign * trial.scores.mean() for trial in trials)
     scale = min(abs(score), abs(metric.worst - score))
-    costs = [sign * trial.scores + SHARE_PER_BANDWIDTH * scale * math.log(trial.mbps) for trial in trials]
+    costs = [sign * trial.scores + price * scale * math.log(trial.mbps) for trial in trials]
     least = min(costs, key=np.mean)
     lost = [np.bincount(groups, cost - least) / np.bincount(groups) for cost in costs]
     errors = [one.std(ddof=1) / math.sqrt(len(one)) if len(one) > 1 else 0.0 for one in lost]
@@ -303,7 +344,7 @@ class GoalSearch:
         goal, count = self.request.goal or 0.0, FEW_SCENES
         while True:
             self.scenes.score([trial], count)
-            score = mean_interval(trial.scores, self.request.seed, self.scenes.groups[:count])
+            score = mean_interval(trial.scores, self.scenes.groups[:count], limits=self.metric.limits)
             low, high = (score.mean if end is None else end for end in score[1:])
             if not low <= goal <= high or 2 * count > MOST_SCENES:
                 return score, high <= goal if self.metric.better == "lower" else low >= goal

@@ -29,6 +29,8 @@ RELATIVE_FLOOR = 1e-4
 # Bounds move inward by this share, so that a value at its bound still keeps it after unit conversions, the
 # interval's own arithmetic and writing; a micrometre per kilometre.
 INWARD = SLACK
+# Rolls beyond this would swap what is called horizontal and vertical.
+LARGEST_ROLL_RAD = math.pi / 4
 
 Pins = tuple[float | None, float | None, float | None]
 
@@ -58,6 +60,7 @@ class Bounds:
         origin_thickness: Largest standard deviation of the origin along its thinnest direction [m].
         azimuth_centre, azimuth_half: Interval of the boresight's azimuth on the circle [rad].
         elevation_low, elevation_high: Of the boresight [rad].
+        roll_low, roll_high: Of the boresight, within an eighth of a turn [rad].
         spread_low, spread_high: Angular standard deviations, horizontal and vertical, shape (K, 2) [rad].
         start_low, start_high, end_low, end_high, width_low, width_high: Of the gate [m].
     """
@@ -73,6 +76,8 @@ class Bounds:
     azimuth_half: np.ndarray
     elevation_low: np.ndarray
     elevation_high: np.ndarray
+    roll_low: np.ndarray
+    roll_high: np.ndarray
     spread_low: np.ndarray
     spread_high: np.ndarray
     start_low: np.ndarray
@@ -113,6 +118,8 @@ class Bounds:
             azimuth_half=np.full(count, math.pi),
             elevation_low=np.full(count, -math.pi / 2),
             elevation_high=np.full(count, math.pi / 2),
+            roll_low=np.full(count, -LARGEST_ROLL_RAD),
+            roll_high=np.full(count, LARGEST_ROLL_RAD),
             spread_low=np.zeros((count, 2)),
             spread_high=np.full((count, 2), math.pi / interval),
             start_low=low,
@@ -208,6 +215,10 @@ def _bounds_row(rules: SensorRules, space: DesignSpace, interval: float) -> dict
         lowest = max(space.low[ELEVATION], lowest if elevation.min is None else math.radians(elevation.min))
         highest = min(space.high[ELEVATION], highest if elevation.max is None else math.radians(elevation.max))
         lowest, highest = poles if (lowest, highest) == poles else inward(lowest, highest)
+    roll = rules.boresight.roll_deg
+    limits = inward(-45.0 if roll.min is None else roll.min, 45.0 if roll.max is None else roll.max)
+    is_open = roll.min is None and roll.max is None
+    rolls = (-LARGEST_ROLL_RAD, LARGEST_ROLL_RAD) if is_open else tuple(map(math.radians, limits))
     fields_deg = [
         inward(field.min or 0.0, 360.0 if field.max is None else field.max)
         for field in (rules.field_of_view.horizontal_deg, rules.field_of_view.vertical_deg)
@@ -225,6 +236,8 @@ def _bounds_row(rules: SensorRules, space: DesignSpace, interval: float) -> dict
         "azimuth_half": half,
         "elevation_low": lowest,
         "elevation_high": highest,
+        "roll_low": rolls[0],
+        "roll_high": rolls[1],
         "spread_low": [math.radians(field[0]) / unit for field, unit in zip(fields_deg, units, strict=True)],
         "spread_high": [math.radians(field[1]) / unit for field, unit in zip(fields_deg, units, strict=True)],
         **_gate_bounds(rules.gate, space),

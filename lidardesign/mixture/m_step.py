@@ -17,15 +17,13 @@ import math
 
 import numpy as np
 
-from lidardesign.mixture.bounds import Bounds, Floors, clip_azimuth
+from lidardesign.mixture.bounds import LARGEST_ROLL_RAD, Bounds, Floors, clip_azimuth
 from lidardesign.mixture.components import SMALLEST_WEIGHT, Features, Mixture, Statistics, frames
 from lidardesign.mixture.origin_step import OriginLimits, best_origins
 from lidardesign.numerics import COARSE_SLACK, SLACK, box_quadratic_minimum, sphere_exp, sphere_log, wrap_angle
 
 # A component with less than this share of the samples keeps its parameters: its moments are rounding noise.
 SMALLEST_MASS = SLACK
-# Rolls beyond this would swap what is called horizontal and vertical.
-LARGEST_ROLL_RAD = math.pi / 4
 # Boresights this close to a pole have no usable azimuth metric; the box is then enforced by clipping alone.
 POLE_COSINE = COARSE_SLACK
 
@@ -208,25 +206,26 @@ def _move_boresights(
 def fit_field(
     moment: np.ndarray, previous: np.ndarray, bounds: Bounds, floor: float, rolls: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Roll within +-45 degrees and bounded spreads at the largest likelihood.
+    """Roll and spreads inside their bounds at the largest likelihood.
 
-    The optimum has the axes of the moment's eigenvectors or, where that would swap horizontal and vertical, a
-    roll at the limit; the previous roll is tried too, so that the step never loses.
+    The optimum has the axes of the moment's eigenvectors or, where that would swap horizontal and vertical, or break a
+    bound, a roll at the limit; the previous roll is tried too, so that the step never loses.
 
     Arguments:
         moment: Second moments of the tangent coordinates about the boresight, roll 0 axes, (K, 2, 2) [rad^2].
         previous: The roll before, shape (K,) [rad].
-        bounds: Bounds on the spreads.
+        bounds: Bounds on roll and spreads.
         floor: Smallest spread where the bounds do not force a smaller one [rad].
         rolls: Whether there is a roll to choose.
     """
     eigen = 0.5 * np.arctan2(2 * moment[:, 0, 1], moment[:, 0, 0] - moment[:, 1, 1])
     # the axis called horizontal is the eigenvector nearer to it
     eigen = np.where(np.abs(eigen) > LARGEST_ROLL_RAD, eigen - np.copysign(math.pi / 2, eigen), eigen)
-    zero, limit = np.zeros(len(moment)), np.full(len(moment), LARGEST_ROLL_RAD)
+    zero = np.zeros(len(moment))
     turned = wrap_angle(2 * np.asarray(previous)) / 2
     turned = np.where(np.abs(turned) > LARGEST_ROLL_RAD, zero, turned)
-    rolls_tried = np.stack([eigen, zero, limit, -limit, turned]) if rolls else zero[None]
+    rolls_tried = np.stack([eigen, zero, bounds.roll_high, bounds.roll_low, turned]) if rolls else zero[None]
+    rolls_tried = np.clip(rolls_tried, bounds.roll_low, bounds.roll_high) if rolls else rolls_tried
     low = np.minimum(np.maximum(bounds.spread_low, floor), bounds.spread_high)
     cos, sin = np.cos(rolls_tried), np.sin(rolls_tried)
     xx, xy, yy = moment[:, 0, 0], moment[:, 0, 1], moment[:, 1, 1]

@@ -152,6 +152,21 @@ def named_parts(names: Sequence[str] | str, bounded: Iterable[str] = ()) -> list
     return parts
 
 
+def parts_of(design: DesignSpec) -> list[Part | None]:
+    """The parts that the sensors of a design are; None for those that are none, or whose part is not at hand."""
+    named = (design.constraints.get("parts") or {}).get("names") or ()
+    texts = [] if isinstance(named, str) else named
+    own = [text.rsplit(":", 1)[0] if f"{SUFFIX}:" in text else text for text in texts]
+    return [None if sensor.part is None else _part_at_hand(sensor.part, own) for sensor in design.sensors]
+
+
+def _part_at_hand(name: str, own: Sequence[str]) -> Part | None:
+    try:
+        return load_library([Path(text) for text in own if text.endswith(SUFFIX) or Path(text).is_dir()]).part(name)
+    except ConfigError:
+        return None
+
+
 def _named(names: Sequence[str] | str) -> list[Part]:
     if names == "catalog":
         library = load_library()

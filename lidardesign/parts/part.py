@@ -224,6 +224,13 @@ class Part:
         return -(-self.rays // rows), rows
 
     @property
+    def beam_rad(self) -> float:
+        """The angle of what one ray sees: a zone's, of rectangular ones the mean, or what is stated; 0: unknown."""
+        if isinstance(self.pattern, Zones):
+            return math.sqrt(math.prod(self.field_of_view_rad) / self.rays)
+        return (self.value("divergence_mrad") or 0.0) / 1000
+
+    @property
     def range_m(self) -> tuple[float, float]:
         """The range that it measures, from and to, by the first statements [m]; from 0 where none states it."""
         return self.value("near_m") or 0.0, self.figures["far_m"][0].value

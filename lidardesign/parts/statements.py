@@ -190,6 +190,7 @@ class Figures(_Keys):
         rate_hz: Frames per second.
         returns: Echoes per ray at most.
         wavelength_nm, divergence_mrad, power_w: Of its light; power is what the part consumes.
+        price: In the currency of whoever compares prices.
         noise_m: Standard deviation of a range.
         accuracy_m, accuracy_percent: The largest error of a range, or its share.
         bins, bin_ps, bits_per_bin: The histogram that it gives per ray, where it gives one.
@@ -216,6 +217,7 @@ class Figures(_Keys):
     frame_bytes: Wholes | None = None
     points_per_s: Values | None = None
     power_w: Values | None = None
+    price: Values | None = None
 
 
 FIELDS = tuple(Figures.model_fields)

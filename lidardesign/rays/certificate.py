@@ -3,10 +3,12 @@
 For thresholds t >= 0 of items and a price lambda >= 0 of bandwidth, every admissible choice S has
 
     F(S) - harm(S) <= sum_u w_u t_u + lambda B
-                      + max_R sum_{r in R} max_g [ sum_u w_u (a(r,g,u) - t_u)+ - lambda b(r,g) - h(r,g) ]+
+                      + max_R sum_{r in R} max_g [ sum_u w_u (a(r,g,u) - t_u)+ - lambda b(r,g) - h(r,g) ]
 
-where R holds the best rays of each group of candidates, as many as may be chosen of it (Cornuejols, Fisher and
-Nemhauser 1977): whatever the thresholds, an item counts at most its threshold and what single rays exceed it by.
+where R holds the best rays of each group of candidates (Cornuejols, Fisher and Nemhauser 1977): whatever the
+thresholds, an item counts at most its threshold and what single rays exceed it by. As choices fill their counts, R does
+so too, with a ray of every sensor where each has to fire: rays that harm more than they are worth are charged. Where a
+budget leaves rays of the choice unfired, R may leave out any.
 Subgradients lower the bound, each with a part of the one before, as else they zigzag (Camerini, Fratta and Maffioli
 1975). For concave sums phi(z) <= phi(y) + slope(y) (z - y) takes the place of thresholds, and Frank and Wolfe (1956)
 choose y.
@@ -20,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from lidardesign.numerics import COARSE_SLACK, ROUNDING
+from lidardesign.numerics import COARSE_SLACK, ROUNDING, SLACK
 from lidardesign.rays import kernels
 from lidardesign.rays.choice import Choice, RayCounts, choose
 from lidardesign.rays.coverage import Coverage
@@ -93,7 +95,13 @@ def certificate_document(
 
 
 def certify(
-    coverage: Coverage, counts: RayCounts, choice: Choice, *, budget_mbps: float | None = None, rounds: int = ROUNDS
+    coverage: Coverage,
+    counts: RayCounts,
+    choice: Choice,
+    *,
+    budget_mbps: float | None = None,
+    full: bool = True,
+    rounds: int = ROUNDS,
 ) -> Certificate:
     """The bound for choices of the same candidates, counts, and price or budget.
 
@@ -102,11 +110,12 @@ def certify(
         counts: Numbers of rays by group.
         choice: The choice; its price is the bound's where there is no budget.
         budget_mbps: Largest bandwidth, if there is a budget [Mbit/s].
+        full: Whether counts are filled, as in `choose`.
         rounds: Largest number of steps.
     """
     value = choice.worth - choice.harm - (0.0 if budget_mbps is not None else choice.price * choice.bits)
     dual = Thresholds if len(coverage.table) == 0 else Tangents
-    search = dual(coverage, _Admissible(coverage, counts, choice.price, budget_mbps), choice)
+    search = dual(coverage, _Admissible(coverage, counts, choice, budget_mbps, full=full), choice)
     bound, made = np.inf, 0
     while made < rounds:
         bound, made = min(bound, search.step(value)), made + 1
@@ -118,11 +127,24 @@ def certify(
 class _Admissible:
     """Admissible choices: a number of rays per group, at a price or within a budget."""
 
-    def __init__(self, coverage: Coverage, counts: RayCounts, price: float, budget_mbps: float | None) -> None:
-        self.coverage, self.counts, self.budget_mbps = coverage, counts, budget_mbps
-        self.price = price
+    def __init__(
+        self, coverage: Coverage, counts: RayCounts, choice: Choice, budget_mbps: float | None, *, full: bool
+    ) -> None:
+        self.coverage, self.counts, self.price = coverage, counts, choice.price
         self.allowed = np.isfinite(coverage.bits)
         self.bits = np.where(self.allowed, coverage.bits, 0.0)
+        # a little more than the slack of choices: the cheapest rays fit, however their bits are added up
+        self.budget_mbps = None if budget_mbps is None else budget_mbps * (1 + 2 * SLACK)
+        fired, there = (
+            np.bincount(counts.group[rays], minlength=len(counts.most))
+            for rays in (choice.rays, self.allowed.any(axis=1))
+        )
+        # that counts can be filled within a budget, and every sensor can fire, the choice itself shows
+        is_filled = bool((fired >= np.minimum(counts.most, there)).all())
+        self.full = full and (self.budget_mbps is None or (is_filled and choice.bits <= self.budget_mbps))
+        owner, is_one = counts.owner, len(counts.most) == 1
+        is_owned = self.full and is_one and owner is not None and len(np.setdiff1d(owner, owner[choice.rays])) == 0
+        self.owner = owner if is_owned else None
 
     def best(self, excess: np.ndarray) -> tuple[float, np.ndarray]:
         """The largest sum of single gates' excess (N, G), and its gates, -1 for none, (N,).
@@ -156,11 +178,15 @@ class _Admissible:
         gate = np.argmax(net, axis=1)
         most = net[np.arange(len(gate)), gate]
         taken = np.full(len(gate), -1)
-        total = 0.0
+        total, least = 0.0, -np.inf if self.full else 0.0
         for group, count in enumerate(self.counts.most):
-            own = np.flatnonzero((self.counts.group == group) & (most > 0))
+            own = np.flatnonzero((self.counts.group == group) & (most > least))
             if len(own) > count:
-                own = own[np.argsort(-most[own], kind="stable")[:count]]
+                cost = -most[own]
+                if self.owner is not None:
+                    order = np.argsort(cost, kind="stable")
+                    cost[order[np.unique(self.owner[own[order]], return_index=True)[1]]] = -np.inf
+                own = own[np.argpartition(cost, count)[:count]]
             taken[own] = gate[own]
             total += float(most[own].sum())
         return total, taken

@@ -215,17 +215,24 @@ def choose(
 
 
 def _choose_layers(
-    coverage: Coverage, counts: RayCounts, prices: Sequence[float], limit_mbps: float, *, full: bool, passes: int
+    coverage: Coverage,
+    counts: RayCounts,
+    prices: Sequence[float],
+    limit_mbps: float,
+    *,
+    full: bool,
+    passes: int,
+    layered: bool = True,
 ) -> Choice:
-    """Layers of rays at the first price; the last layer is improved at the other prices too."""
+    """Layers of rays at the first price, or all rays in one; the last layer is improved at the other prices too."""
     search = _Search(coverage, counts)
-    search.improve(prices[0], limit_mbps, full=full, passes=passes)
-    while full and search.is_open:
+    search.improve(prices[0], limit_mbps, full=full, passes=passes if layered else 0)
+    while layered and full and search.is_open:
         search.begin_layer()
         search.improve(prices[0], limit_mbps, full=full, passes=passes)
     if full:
         search.fill_up()
-    for price in prices[1:]:
+    for price in prices[layered:]:
         search.improve(price, limit_mbps, full=full, passes=passes)
     return search.choice(prices[0])
 
@@ -262,4 +269,8 @@ def choose_within(
             high, tried = middle, bits
         else:
             low = middle
-    return _choose_layers(coverage, counts, (high, low, 0.0), budget_mbps, full=full, passes=passes)
+    found = _choose_layers(coverage, counts, (high, low, 0.0), budget_mbps, full=full, passes=passes)
+    if full and len(found.rays) < len(free.rays):
+        # swaps spent what further layers need
+        return _choose_layers(coverage, counts, (high, low, 0.0), budget_mbps, full=True, passes=passes, layered=False)
+    return found

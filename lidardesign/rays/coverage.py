@@ -20,6 +20,9 @@ from lidardesign.rays import kernels
 from lidardesign.rays.training import LARGEST, InformedScene
 
 MOST_GATES = 8  # of a ray: an entry keeps one bit for each
+# Where a sensor may fail: how much the mean over losses counts, and of how many sensors an item's loss is asked.
+# The mean over losses alone lets two sensors see the same: faces are 11 % worse while both live, and lose no less.
+LOSS_SHARE, MOST_LOSSES = 0.5, 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,6 +130,33 @@ class Coverage:
         item, worth, gates = kernels.group_entries(self.entries, first, members, self.shape[1], begin, True)
         bits, harm = (np.array([values[rays].sum(axis=0) for rays in groups]) for values in (self.bits, self.harm))
         return replace(self, start=begin, item=item, worth=worth, gates=gates, bits=bits, harm=harm)
+
+    def with_losses(self, sensor: np.ndarray, sensors: int) -> Coverage:
+        """The table whose F is half of this one's and half of its mean over the loss of each sensor.
+
+        Every item has a copy for each loss, of many sensors for a few of them by turns, and one without a loss. A ray
+        informs about all copies but that for the loss of its own sensor, whose harm is lost too.
+
+        Arguments:
+            sensor: The sensor of each ray, (N,).
+            sensors: Their number.
+        """
+        losses = min(sensors, MOST_LOSSES)
+        lost = (np.arange(len(self.weight))[:, None] + np.arange(losses)) % sensors
+        lost = np.column_stack([lost, np.full(len(lost), -1)])
+        informs = lost[self.item] != sensor[self.ray][:, None]
+        copies = np.append(0, np.cumsum(informs.sum(axis=1)))
+        number = (losses + 1) * self.item[:, None] + np.arange(losses + 1, dtype=np.int32)
+        share = np.append(np.full(losses, LOSS_SHARE / losses), 1 - LOSS_SHARE)
+        return replace(
+            self,
+            start=copies[self.start],
+            item=number[informs],
+            worth=np.repeat(self.worth, np.diff(copies)),
+            gates=np.repeat(self.gates, np.diff(copies)),
+            weight=(self.weight[:, None] * share).ravel(),
+            harm=self.harm * (1 - LOSS_SHARE / sensors),
+        )
 
     def known(self, gate: np.ndarray) -> np.ndarray:
         """The known worth of each item, (U,), by a choice of one gate per ray, -1 for none, (N,)."""

@@ -43,12 +43,14 @@ class Proposals:
         rules: Their constraints, which bound regions of origins.
         level: The share of each marginal that fields of view and gates hold.
         samples: Samples of the density, at all values of its conditions.
+        by_turns: Whether sensors that see the same take turns in firing there.
     """
 
     sensors: Sequence[Sensor]
     rules: Sequence[SensorRules]
     level: float
     samples: Samples
+    by_turns: bool = False
 
     def draw(
         self, count: int, at: Mapping[str, float], generator: np.random.Generator, least: np.ndarray | None = None
@@ -63,7 +65,7 @@ class Proposals:
         """
         samples, least = nearest_samples(self.samples, at), np.zeros(len(self.sensors)) if least is None else least
         sensors = self.sensors_at(at)
-        owner, fired = owners(sensors, self.rules, self.level, samples.points, samples.space)
+        owner, fired = self.owners(sensors, samples.points, samples.space)
         inside = np.flatnonzero((owner >= 0) & (samples.weights > 0))
         # the same ray at another range is the same candidate
         _, first, same = np.unique(fired[inside, :RANGE], axis=0, return_index=True, return_inverse=True)
@@ -78,6 +80,21 @@ class Proposals:
         if even.any():
             rays = Rays.joined([rays, even_rays(sensors, even)])
         return replace(rays, time_s=np.zeros(len(rays)))
+
+    def owners(
+        self, sensors: Sequence[Sensor], points: np.ndarray, space: DesignSpace
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """As the function `owners`, of sensors as they stand at a value of the condition."""
+        return owners(sensors, self.rules, self.level, points, space, by_turns=self.by_turns)
+
+    def share_of_several(self, at: Mapping[str, float]) -> float:
+        """The share of what the sensors see of the density, at a value of the condition, that several of them see."""
+        samples, sensors = nearest_samples(self.samples, at), self.sensors_at(at)
+        seen = np.zeros(len(samples), dtype=np.intp)
+        for index, sensor in enumerate(sensors):
+            own = [rules_of(self.rules, index)]
+            seen += owners([sensor], own, self.level, samples.points, samples.space)[0] >= 0
+        return float(samples.weights[seen > 1].sum()) / max(float(samples.weights[seen > 0].sum()), TINY)
 
     def sensors_at(self, at: Mapping[str, float]) -> list[Sensor]:
         """The sensors as they stand at a value of the condition."""
@@ -134,7 +151,13 @@ def nearest_samples(samples: Samples, at: Mapping[str, float], share: float = NE
 
 
 def owners(
-    sensors: Sequence[Sensor], rules: Sequence[SensorRules], level: float, points: np.ndarray, space: DesignSpace
+    sensors: Sequence[Sensor],
+    rules: Sequence[SensorRules],
+    level: float,
+    points: np.ndarray,
+    space: DesignSpace,
+    *,
+    by_turns: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The sensor that fires each design point, -1 where none does, (N,), and the points as they are fired, (N, 6).
 
@@ -147,6 +170,7 @@ def owners(
         level: The share of each marginal that fields of view and gates hold.
         points: Design points, shape (N, 6).
         space: Their design space.
+        by_turns: Whether a point belongs to the next of the sensors that see it instead, point by point.
     """
     observed, z = observed_point(points), interval_factor(level)
     smallest_m = SMALLEST_LENGTH * (float(np.mean([sensor.gate_m for sensor in sensors])) or 1.0)
@@ -176,6 +200,8 @@ def owners(
         score += math.log(sensor.weight) - squares / 2 - np.log(angular).sum() - math.log(depth) + jacobian
         inside &= (np.abs(tangent) <= np.array(sensor.field_of_view_rad) / 2 + FIELD_ROUNDING_RAD).all(axis=1)
         inside &= (own[:, RANGE] >= start) & (own[:, RANGE] < end)
+        if by_turns:
+            score = np.where(inside, -((index - np.arange(len(points))) % len(sensors)), -np.inf)
         better = score > best
         best[better], owner[better], sees[better], fired[better] = score[better], index, inside[better], own[better]
     return np.where(sees, owner, -1), fired

@@ -43,6 +43,7 @@ class Selection:
         shares: The share of the rays that each sensor fires, (S,); None leaves it to the choice.
         is_shared: Whether all rays of a sensor have one gate.
         each_fires: Whether every sensor has to fire a ray.
+        may_fail: Whether the mean over the loss of each sensor counts as much as what all of them see together.
         share: The share of the candidates that is chosen, at the largest number of rays.
         name: Of the design, for messages.
     """
@@ -55,6 +56,7 @@ class Selection:
     shares: np.ndarray | None = None
     is_shared: bool = False
     each_fires: bool = False
+    may_fail: bool = False
     share: float = CHOSEN_SHARE
     name: str = "rays"
 
@@ -70,7 +72,8 @@ class Selection:
     def coverage(self, informed: Sequence[InformedScene], gates_m: np.ndarray) -> Coverage:
         """Information of the candidates about scenes, with the bandwidth of their gates."""
         one_bin = self.bandwidth.mbps_of_widths(np.zeros(1))
-        return gather(informed, gates_m, one_bin * self.bandwidth.bins(gates_m[..., 1] - gates_m[..., 0]))
+        whole = gather(informed, gates_m, one_bin * self.bandwidth.bins(gates_m[..., 1] - gates_m[..., 0]))
+        return whole.with_losses(self.rays.sensor, int(self.rays.sensor.max()) + 1) if self.may_fail else whole
 
     def check_informative(self, coverage: Coverage, scenes: int) -> None:
         """Refuse candidates without any information.

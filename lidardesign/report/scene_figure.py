@@ -181,7 +181,7 @@ def evaluated_scene(evaluation: Evaluation, request: EvaluationRequest) -> Scene
 
     def laid_out(design: DesignSpec, at: Conditions) -> Rays:
         count = design.count or max(numbers_fired(design, request.rays, request.alone))
-        return design.rays(count, at=at or None)
+        return request.fired(design, count, at)
 
     planner = request.planner if any(effect.on for effect in evaluation.effects) else None
     places = ordered_conditions(request)

@@ -60,11 +60,14 @@ def rows_table(evaluation: Evaluation) -> str:
     """All rows at equal rays."""
     metric, detail = evaluation.metric, leading_detail(evaluation.rows)
     details = [] if detail is None else [detail]
-    headings = ["design", "rays", f"{metric.name} [{metric.unit}]", "95 % interval", "failures"]
+    worst = ["worst_decile", *(["worst_lost"] if any(row.lost for row in evaluation.rows) else [])]
+    headings = ["design", "rays", f"{metric.name} [{metric.unit}]", "95 % interval", *map(_words, worst), "failures"]
     headings += [*map(_words, details), "Mbit/s", "seconds"]
     lines = []
     for index, row in enumerate(evaluation.rows):
-        cells = [row.design, str(row.rays), four_digits(row.value), interval(row), str(row.failures)]
+        cells = [row.design, str(row.rays), four_digits(row.value), interval(row)]
+        values = [getattr(row, name) for name in worst]
+        cells += ["-" if value is None else four_digits(value) for value in values] + [str(row.failures)]
         cells += [four_digits(row.details[name]) if name in row.details else "-" for name in details]
         cells += [four_digits(row.bandwidth_mbps), f"{row.seconds:.2f}"]
         lines.append((cells, "", bool(index and row.design != evaluation.rows[index - 1].design)))

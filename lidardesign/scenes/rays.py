@@ -54,6 +54,7 @@ class Rays:
         time_s: Firing times within the frame [s], shape (N,).
         angles_rad: Azimuths and elevations that directions were made from, shape (N, 2); None: computed from the
             directions. Files hold angles: reading and writing them again changes no digit.
+        light: Light of each ray's emitter as a multiple of its detector's, as of real parts, shape (N,); None: 1.
 
     Raises:
         ConfigError: Non-finite values, directions that are not unit vectors, reversed or negative gates.
@@ -76,6 +77,7 @@ class Rays:
     sensor: np.ndarray
     time_s: np.ndarray
     angles_rad: np.ndarray | None = None
+    light: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         count = len(self.origin_m)
@@ -86,6 +88,7 @@ class Rays:
             ("sensor", (), np.int64),
             ("time_s", (), np.float64),
             *([] if self.angles_rad is None else [("angles_rad", (2,), np.float64)]),
+            *([] if self.light is None else [("light", (), np.float64)]),
         ):
             values = np.ascontiguousarray(getattr(self, name), dtype=dtype)
             if values.shape != (count, *tail):
@@ -116,7 +119,9 @@ class Rays:
     def joined(cls, parts: Sequence[Rays]) -> Rays:
         """Concatenated lists of rays, with angles computed from directions."""
         names = ("origin_m", "direction", "gate_m", "sensor", "time_s")
-        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+        light = [np.ones(len(part)) if part.light is None else part.light for part in parts]
+        some = np.concatenate(light) if any(part.light is not None for part in parts) else None
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names), light=some)
 
     @property
     def azimuth_rad(self) -> np.ndarray:

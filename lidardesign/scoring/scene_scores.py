@@ -10,7 +10,8 @@ import itertools
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,6 +29,37 @@ from lidardesign.task import Metric, Score, Task
 from lidardesign.workers import Starmap
 
 RaysPerCondition = tuple[Rays, ...]  # one list of rays per condition value, in the task's order
+
+
+class Devices(NamedTuple):
+    """The devices that the rays of a baseline are of: as many as those of the design beside it.
+
+    Arguments:
+        number: Each fires every so many-th ray.
+        light: Of their emitters as a multiple of the detector's, the mean over the design's rays; None: 1.
+    """
+
+    number: int = 1
+    light: float | None = None
+
+    @classmethod
+    def of(cls, positions: RaysPerCondition) -> Devices:
+        """The devices of a design by its rays."""
+        rays = Rays.joined(positions)
+        return cls(max(len(np.unique(rays.sensor)), 1), None if rays.light is None else float(rays.light.mean()))
+
+    def firing(self, positions: RaysPerCondition) -> RaysPerCondition:
+        """Rays of one sensor as rays of these devices; those that have sensors keep them."""
+        if self == ONE_DEVICE or any(rays.sensor.any() for rays in positions):
+            return positions
+        light = [None if self.light is None else np.full(len(rays), self.light) for rays in positions]
+        return tuple(
+            replace(rays, sensor=np.arange(len(rays)) % self.number, light=own)
+            for rays, own in zip(positions, light, strict=True)
+        )
+
+
+ONE_DEVICE = Devices()
 # Rays times frames that are traced together: their returns take 24 bytes each.
 MOST_RETURNS = 4_000_000
 # Frames that are checked for returns from targets; a larger share without any is noted.
@@ -74,6 +106,11 @@ def score_lists(
             started = time.perf_counter()
             score = checked_score(task, metric, scene, returns)
             yield score, time.perf_counter() - started + per_ray * _count(positions)
+
+
+def without_each(positions: RaysPerCondition, sensors: int) -> list[RaysPerCondition]:
+    """The rays that are left without each of a number of sensors, one after the other."""
+    return [tuple(rays.subset(np.flatnonzero(rays.sensor != lost)) for rays in positions) for lost in range(sensors)]
 
 
 def _count(positions: RaysPerCondition) -> int:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidardesign.errors import ConfigError
+from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Scene
 from lidardesign.simulate.detector.dead_time import find_corrected
 from lidardesign.simulate.detector.kernels import (
@@ -59,12 +60,19 @@ class Detections:
 
 
 def detect(
-    scene: Scene, frame: int, windows_m: np.ndarray, echoes: Echoes, background: Background, physics: Physics
+    scene: Scene,
+    frame: int,
+    rays: Rays,
+    windows_m: np.ndarray,
+    echoes: Echoes,
+    background: Background,
+    physics: Physics,
 ) -> Detections:
-    """Detect the returns of all rays of a frame, which share the emitter's light.
+    """Detect the returns of all rays of a frame; those of a sensor share its emitter's light.
 
     Arguments:
         scene, frame: They name the random streams.
+        rays: The rays, N of them.
         windows_m: Each ray's gate in half paths, closed at the start and open at the end, shape (N, 2) [m].
         echoes: The light that comes back.
         background: Counts from ambient light, dark counts and haze.
@@ -77,7 +85,7 @@ def detect(
     if physics.detector.photons is None or not physics.effects & COUNTED:
         return _strongest(scene, frame, windows_m, echoes, physics)
     path_m = np.full(len(windows_m), np.nan)
-    light = ArrivingLight.of(windows_m, echoes, background, physics)
+    light = ArrivingLight.of(rays, windows_m, echoes, background, physics)
     for begin, end in light.bins.chunks():
         path_m[begin:end] = _from_photons(scene, frame, light.part(begin, end), physics)
     # The body of the strongest echo near each detected half path, -1 where there is none
@@ -103,7 +111,7 @@ def _from_photons(scene: Scene, frame: int, light: ArrivingLight, physics: Physi
         # it judges in the same way, and finds nothing to correct, where it is never blind
         dead_s = detector.photons.dead_s if "pile_up" in physics.effects else 0.0
         times_m = metres(dead_s), metres(1 / detector.photons.repetition_hz)
-        place = find_corrected(*judged, max(light.pulses, 1.0), *(time_m / bins.width_m for time_m in times_m))
+        place = find_corrected(*judged, np.maximum(light.pulses, 1.0), *(time_m / bins.width_m for time_m in times_m))
     else:
         place = find_returns(*judged)
     low, high = bins.windows_m[:, 0], bins.windows_m[:, 1]
@@ -160,8 +168,7 @@ class ArrivingLight:
     Arguments:
         bins: Bins of the histograms.
         first_ray: Index of the first ray in the list.
-        rays: Number of rays in the list, which share the emitter's energy.
-        pulses: Number of pulses per ray.
+        pulses: Number of pulses of each ray, shape (N,).
         echo_offset: Echoes of ray i are echo_offset[i] to echo_offset[i + 1], shape (N + 1,).
         path_m: Half paths of the echoes, shape (E,) [m].
         expected: Expected counts of the echoes in a frame, shape (E,).
@@ -171,8 +178,7 @@ class ArrivingLight:
 
     bins: Bins
     first_ray: int
-    rays: int
-    pulses: float
+    pulses: np.ndarray
     echo_offset: np.ndarray
     path_m: np.ndarray
     expected: np.ndarray
@@ -181,24 +187,27 @@ class ArrivingLight:
     haze: np.ndarray | None = None
 
     @classmethod
-    def of(cls, windows_m: np.ndarray, echoes: Echoes, background: Background, physics: Physics) -> ArrivingLight:
+    def of(
+        cls, rays: Rays, windows_m: np.ndarray, echoes: Echoes, background: Background, physics: Physics
+    ) -> ArrivingLight:
         """All the light of a list of rays with windows (N, 2) [m].
 
         Raises:
             ConfigError: A window has too many bins.
         """
         count, photons = len(windows_m), physics.detector.photons
+        sharing = physics.detector.sharing(rays)
         bins = bins_of(windows_m, echoes, physics.detector, "quantisation" in physics.effects)
         order = np.argsort(echoes.ray, kind="stable")
         offset = np.concatenate([[0], np.cumsum(np.bincount(echoes.ray, minlength=count))])
-        pulses = photons.pulses(count)
-        per_gain = pulses * photons.emitted(count) * photons.aperture_m2 * photons.efficiency
+        pulses = photons.pulses(sharing)
+        per_pulse = photons.emitted(sharing) * physics.detector.light_of(rays)
+        per_gain = (pulses * per_pulse * photons.aperture_m2 * photons.efficiency)[echoes.ray[order]]
         # limited before the product: a surface that touches the receiver has the largest gain there is
         expected = np.minimum(echoes.gain[order], MOST_COUNTS / per_gain) * per_gain
         return cls(
             bins,
             0,
-            count,
             pulses,
             offset,
             echoes.path_m[order],
@@ -214,8 +223,7 @@ class ArrivingLight:
         return ArrivingLight(
             self.bins.part(begin, end),
             self.first_ray + begin,
-            self.rays,
-            self.pulses,
+            self.pulses[begin:end],
             self.echo_offset[begin : end + 1] - self.echo_offset[begin],
             self.path_m[echoes],
             self.expected[echoes],
@@ -242,10 +250,10 @@ def count_photons(scene: Scene, frame: int, light: ArrivingLight, physics: Physi
         _add_even(counts, light, light.bins.windows_m, total[:, None], physics.stream("ambient", scene, frame))
     if light.haze is not None:
         key = physics.stream("atmosphere", scene, frame)
-        _add_even(counts, light, light.edges_m, light.pulses * light.haze, key)
+        _add_even(counts, light, light.edges_m, light.pulses[:, None] * light.haze, key)
     if "pile_up" in physics.effects:
         key = physics.stream("pile_up", scene, frame)
-        counts = survive_dead_time(counts, light.bins, physics.detector.photons, light.rays, key, light.first_ray)
+        counts = survive_dead_time(counts, light.bins, physics.detector.photons, light.pulses, key, light.first_ray)
     return counts
 
 

@@ -229,7 +229,7 @@ class Planner:
 
         Arguments:
             scene: The scene.
-            lists: Each shares the emitter's energy among its own rays; the list that changes most decides.
+            lists: Lists of rays; the one that changes most decides.
             casters: One per frame; None builds them where a ray has to be cast.
 
         Raises:

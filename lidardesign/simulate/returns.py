@@ -70,7 +70,8 @@ def simulate_many(
         scene: The scene; targets and occluders both stop rays.
         lists: Lists of rays, each fired anew in each frame.
         casters: One caster per frame; None builds them here.
-        physics: A detector and the effects that are on; each list shares the emitter's energy among its own rays.
+        physics: A detector and the effects that are on; the rays of each sensor in a list share its
+            emitter's energy.
         repeats: `Physics.repeat` of each list; None: the same for all lists.
 
     Returns:
@@ -119,7 +120,7 @@ def measure(scene: Scene, frame: int, rays: Rays, caster: SceneCaster, physics: 
     Arguments:
         scene: The scene.
         frame: The time frame.
-        rays: The rays that share the emitter's energy, N of them.
+        rays: The rays, N of them; those of a sensor share its emitter's energy.
         caster: Caster of this frame.
         physics: The detector and at least one effect.
     """
@@ -127,7 +128,7 @@ def measure(scene: Scene, frame: int, rays: Rays, caster: SceneCaster, physics: 
     from lidardesign.simulate.detection import detect
 
     light = followed_light(scene, frame, rays, caster, physics)
-    found = detect(scene, frame, light.windows_m, light.echoes, light.background, physics)
+    found = detect(scene, frame, rays, light.windows_m, light.echoes, light.background, physics)
     # rays without a return keep the outcome of their geometry, or were not detected
     first = np.full(len(rays), np.inf)
     np.minimum.at(first, light.beams.ray, light.hits.range_m)
@@ -183,14 +184,14 @@ class PhotonHistograms:
         width_m: Width of a bin in half path [m].
         number: Number of bins of each ray, shape (N,).
         counts: Photons counted per bin, zero beyond a ray's own bins, shape (N, most bins).
-        pulses: Number of pulses per ray.
+        pulses: Number of pulses of each ray, shape (N,).
     """
 
     start_m: np.ndarray
     width_m: float
     number: np.ndarray
     counts: np.ndarray
-    pulses: float
+    pulses: np.ndarray
 
 
 def photon_histograms(scene: Scene, frame: int, rays: Rays, caster: SceneCaster, physics: Physics) -> PhotonHistograms:
@@ -199,7 +200,7 @@ def photon_histograms(scene: Scene, frame: int, rays: Rays, caster: SceneCaster,
     Arguments:
         scene: The scene.
         frame: The time frame.
-        rays: The rays that share the emitter's energy, N of them.
+        rays: The rays, N of them; those of a sensor share its emitter's energy.
         caster: Caster of this frame.
         physics: A detector that counts photons, and the simulated effects.
 
@@ -218,7 +219,7 @@ def photon_histograms(scene: Scene, frame: int, rays: Rays, caster: SceneCaster,
         )
     light = followed_light(scene, frame, rays, caster, physics)
     check_windows(light.windows_m, detector)
-    whole = ArrivingLight.of(light.windows_m, light.echoes, light.background, physics)
+    whole = ArrivingLight.of(rays, light.windows_m, light.echoes, light.background, physics)
     number = np.diff(whole.bins.offset)
     counts = np.zeros((len(rays), number.max(initial=0)), np.int64)
     for begin, end in whole.bins.chunks():

@@ -24,7 +24,11 @@ SPACE = DesignSpace(
 RULES = {
     "sensors": {"count": 2},
     "origin": {"low_m": [-0.5, -0.5, 0.5], "high_m": [0.5, 0.5, 1.5], "spread_m": {"max": 0.2}},
-    "boresight": {"azimuth_deg": {"min": 330, "max": 60}, "elevation_deg": {"min": -30, "max": 30}},
+    "boresight": {
+        "azimuth_deg": {"min": 330, "max": 60},
+        "elevation_deg": {"min": -30, "max": 30},
+        "roll_deg": {"min": -44, "max": 44},
+    },
     "field_of_view": {"horizontal_deg": {"min": 5, "max": 40}, "vertical_deg": {"max": 40}},
     "gate": {"start_m": {"min": 0.5}, "end_m": {"max": 3.5}, "width_m": {"min": 0.1, "max": 1.0}},
     "budget": {"rays": 64, "bandwidth_mbps": 2.0},
@@ -82,6 +86,8 @@ MUTATIONS = {
     "space.x_m": lambda s: s["origin_m"]["mean"].__setitem__(0, 1.2),
     "boresight.azimuth_deg": lambda s: s["boresight"].__setitem__("azimuth_rad", math.radians(61)),
     "boresight.elevation_deg.max": lambda s: s["boresight"].__setitem__("elevation_rad", 0.53),
+    "boresight.roll_deg.max": lambda s: s["boresight"].__setitem__("roll_rad", 0.78),
+    "boresight.roll_deg.min": lambda s: s["boresight"].__setitem__("roll_rad", -0.79),
     "boresight.elevation_deg.min": lambda s: s["boresight"].__setitem__("elevation_rad", -0.53),
     "field_of_view.horizontal_deg.max": lambda s: s["field_of_view_rad"].__setitem__("horizontal", 0.7),
     "field_of_view.horizontal_deg.min": lambda s: s["field_of_view_rad"].__setitem__("horizontal", 0.08),

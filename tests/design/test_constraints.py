@@ -66,6 +66,8 @@ LIMITS = {
     "budget.rate_hz": ([0.001, 1e12], [0, 0.0009, 1e12 + 0.5]),
     "boresight.azimuth_deg.min": ([-36000.0, 0, 36000.0], [math.inf, math.nan, "0", -36001.0, 36001.0, 1e300]),
     "boresight.elevation_deg.min": ([-90, 0.5, 90], [-90.5, 90.5]),
+    "boresight.roll_deg.min": ([-45, 0.5, 45], [-45.5, 45.5]),
+    "boresight.roll_deg.max": ([-45, 0.5, 45], [-45.5, 45.5]),
     "boresight.elevation_deg.max": ([-90, 0.5, 90], [-90.5, 90.5]),
     "field_of_view.horizontal_deg.min": ([0, 0.5, 360], [-0.5, 360.5]),
     "field_of_view.vertical_deg.min": ([0, 0.5, 360], [-0.5, 360.5]),
@@ -77,6 +79,7 @@ LIMITS = {
     "origin.spread_m.max": ([1e-9, 0.5], [0, -0.5, 1e-300]),
     "origin.low_m": ([[0, 0, 0], [-1e9, 0, 1e9]], [[0, 0], [0, 0, 0, 0], [0, 0, "0"], [0, 0, 1e300]]),
     "origin.mounts_m": ([[[0, 0, 0]], [[0, 0, 0], [0, 0, 1]]], [[], [[0, 0]]]),
+    "parts.price.max": ([0.5, 40, 1e9], [0, -1, "40"]),
     "parts.names": ([["a"], ["a", "b"], "catalog"], [[], [""], "a"]),
     "origin.exclude": ([[], [BOX] * 32], [[BOX] * 33, [{"low_m": [0, 0, 0]}]]),
 }

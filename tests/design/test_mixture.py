@@ -217,6 +217,10 @@ def random_bounds(draw, count):
         widths = [draw(st.floats(0.01, 0.3)), draw(st.floats(0.01, 0.3))]
         values["spread_low"], values["spread_high"] = low, low + np.array(widths)
     if draw(st.booleans()):
+        low = draw(st.floats(-math.pi / 4, math.pi / 4))
+        values["roll_low"] = np.full(count, low)
+        values["roll_high"] = np.full(count, draw(st.floats(low, math.pi / 4)))
+    if draw(st.booleans()):
         start, width = 5 * draw(bound), draw(st.floats(0.1, 3.0))
         values["start_low"] = np.full(count, start)
         values["end_high"] = np.full(count, start + width)
@@ -245,7 +249,8 @@ def assert_keeps(mixture, bounds):
     assert (end <= bounds.end_high + tiny).all()
     assert (end - start <= bounds.width_high + tiny).all()
     assert (end - start >= bounds.width_low - tiny).all()
-    assert (np.abs(mixture.roll_rad) <= math.pi / 4 + tiny).all()
+    assert (mixture.roll_rad >= bounds.roll_low - tiny).all()
+    assert (mixture.roll_rad <= bounds.roll_high + tiny).all()
 
 
 @pytest.mark.hard_case("29")
@@ -295,7 +300,8 @@ def test_roll_and_spreads_are_the_best_inside_their_bounds(data, a, b, turn):
         return (-np.log(sigma) - variance / (2 * sigma**2)).sum()
 
     found = quality(roll[0], spread[0])
-    for angle in np.linspace(-math.pi / 4, math.pi / 4, 61):
+    assert bounds.roll_low[0] <= roll[0] <= bounds.roll_high[0]
+    for angle in np.linspace(bounds.roll_low[0], bounds.roll_high[0], 61):
         axes = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
         sigma = np.clip(np.sqrt(np.diag(axes @ moment @ axes.T)), bounds.spread_low[0], bounds.spread_high[0])
         assert found >= quality(angle, sigma) - 1e-9

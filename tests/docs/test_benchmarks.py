@@ -124,6 +124,7 @@ def baseline_document(difference=-0.5, low=-0.9, high=-0.1):
     """What `evaluate` prints about `fit` against one baseline, at one number of rays."""
     row = {"rays": 10, "ci_low": 0.0, "ci_high": 9.0, "bandwidth_mbps": 2.0}
     pair = {"a": "fit", "b": "bounding", "rays": 10, "difference": difference, "ci_low": low, "ci_high": high}
+    pair["percent"] = [100 * end / 5.0 for end in (difference, low, high)]
     return {
         "metric": {"name": "error", "unit": "mm", "better": "lower"},
         "scenes": 3,

@@ -118,7 +118,7 @@ def test_every_row_stands_beside_itself_mounted_exactly():
     rows = rows_by_key(exact)
     for row, cost in zip(mounting.rows, mounting.costs, strict=True):
         own = rows[row.design, row.rays]
-        found = paired_difference(row.per_scene, own.per_scene, 3, own.groups)
+        found = paired_difference(row.per_scene, own.per_scene, own.groups, limits=exact.metric.limits)
         assert (cost.difference, cost.ci_low, cost.ci_high) == pytest.approx(found)
         assert cost.difference == pytest.approx(row.value - own.value)
     # an aimed pencil of rays suffers; rays in all directions do not mind

@@ -172,16 +172,17 @@ def test_intervals_are_over_groups_of_scenes():
     alone, grouping = (evaluate(make_request(test=test)) for test in (scenes(2, 12), grouped(12, "a", "b", "c")))
     assert (alone.groups, grouping.groups) == (12, 3)
     (told,) = (note for note in grouping.notes if "groups" in note)
-    assert told.startswith("the 12 held-out scenes are of 3 groups, too few for narrow intervals")
+    assert told.startswith("the 12 held-out scenes are of 3 groups: few groups")
     assert not any("groups" in note for note in alone.notes)
+    limits = grouping.metric.limits
     for row in grouping.rows:
         np.testing.assert_array_equal(row.groups, np.arange(12) % 3)
-        assert (row.value, row.ci_low, row.ci_high) == mean_interval(row.per_scene, 0, np.arange(12) % 3)
+        assert (row.value, row.ci_low, row.ci_high) == mean_interval(row.per_scene, np.arange(12) % 3, limits=limits)
     rows = rows_by_key(grouping)
     for pair in (*grouping.paired, *grouping.paired_bandwidth):
         if pair.rays_b is None:
             first, second = rows[pair.a, pair.rays], rows[pair.b, pair.rays]
-            apart = paired_difference(first.per_scene, second.per_scene, 0, np.arange(12) % 3)
+            apart = paired_difference(first.per_scene, second.per_scene, np.arange(12) % 3, limits=limits)
             assert (pair.difference, pair.ci_low, pair.ci_high) == apart
 
 

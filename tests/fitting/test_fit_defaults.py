@@ -13,7 +13,6 @@ from support.sensors import normal_sensor
 
 from lidardesign.api.run import open_run
 from lidardesign.errors import ConfigError, InfeasibleError
-from lidardesign.fitting import fit as fits
 from lidardesign.fitting import request as requests
 from lidardesign.fitting import trials as tried
 from lidardesign.fitting.request import BEST, CHOSEN_LEVEL, FitOptions, FitRequest
@@ -204,13 +203,13 @@ class Repeated:
             one.scores = np.append(one.scores, np.tile(one.later, times))
 
 
-def best_of(trials, scenes, better="lower", worst=100.0, most=4):
+def best_of(trials, scenes, better="lower", worst=100.0, most=4, **price):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tried, "FEW_SCENES", len(scenes))
         patch.setattr(tried, "MOST_SCENES", most)
         for one in trials:
             one.scores = np.zeros(0)
-        return tried.best_of(trials, Repeated(scenes), Metric("error", "mm", better, worst, 0.0))
+        return tried.best_of(trials, Repeated(scenes), Metric("error", "mm", better, worst, 0.0), **price)
 
 
 class TestTheBestNumber:
@@ -251,6 +250,12 @@ class TestTheBestNumber:
         assert best_of([few, more, lost], SCENES, most=400).sensors == 2
         assert len(few.scores) == len(more.scores) > len(lost.scores) == 4
 
+    @given(st.lists(st.floats(1, 9), min_size=4, max_size=4))
+    def test_without_a_price_has_the_best_mean_in_any_bandwidth(self, scores):
+        few, more = trial(1, *scores), trial(2, 1, 9, 5, 4, mbps=100.0)
+        wanted = 1 if np.mean(scores) <= 4.75 else 2
+        assert best_of([few, more], SCENES, price=None).sensors == wanted
+
     def test_of_a_single_scene_is_the_lowest(self):
         assert best_of([trial(1, 5), trial(2, 4)], SCENES[:1]).sensors == 2
 
@@ -271,7 +276,7 @@ class TestTheCommand:
         def never(*_):
             raise AssertionError("numbers of sensors were tried")
 
-        monkeypatch.setattr(fits, "trials_of", never)
+        monkeypatch.setattr(tried, "trials_of", never)
         for options in (("--sensors", 1), ("--set", "sensors.count=1"), ("--layout", "spinning", "--channels", 1)):
             command = "constrain" if "--set" in options else "fit"
             done = lidardesign(command, flat, *options, "--rays", 4)

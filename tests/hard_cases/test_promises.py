@@ -183,7 +183,7 @@ GIVEN = {
     "split_budget": lambda x: split_budget([1.0, x], 10),
     "lloyd": lambda x: lloyd(np.array([[0.0], [x], [1.0]]), np.ones(3), 2, np.random.default_rng(0)),
     "Constraints": lambda x: Constraints.from_mapping({"gate": {"width_m": {"max": x}}}),
-    "mean_interval": lambda x: mean_interval([1.0, x], 0),
+    "mean_interval": lambda x: mean_interval([1.0, x]),
     "checked_score": lambda x: checked_score(scoring(x), ERROR, BALL, simulate(BALL, rays_with(0.0, "origin_m"))),
 }
 

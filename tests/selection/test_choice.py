@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from support.coverages import SUMS, relaxed_by_highs, small
 
@@ -45,12 +45,12 @@ def every_choice(coverage, counts):
             yield gate
 
 
-def best_of_all(coverage, counts, price=0.0, budget_mbps=np.inf):
+def best_of_all(coverage, choices, price=0.0, budget_mbps=np.inf):
     def objective(gate):
         bits, harm = coverage.charge(gate)
-        return coverage.value_of(gate) - harm - price * bits if bits <= budget_mbps else -np.inf
+        return coverage.value_of(gate) - harm - price * bits if bits <= min(budget_mbps, 1e9) else -np.inf
 
-    return max(objective(gate) for gate in every_choice(coverage, counts))
+    return max(map(objective, choices))
 
 
 @pytest.mark.parametrize("table", [LARGEST, SUMS], ids=["largest", "sums"])
@@ -83,11 +83,38 @@ class TestAChoice:
     def test_is_near_the_best_of_all_and_its_certificate_above_it(self, table, seed, price, most):
         coverage, counts = small(seed, table=table, harm=0.05), RayCounts(np.arange(7) % 2, np.array([most, 1]))
         choice = choose(coverage, counts, price=price, full=False)
-        best = best_of_all(coverage, counts, price)
-        certificate = certify(coverage, counts, choice)
+        best = best_of_all(coverage, every_choice(coverage, counts), price)
+        certificate = certify(coverage, counts, choice, full=False)
         assert certificate.value <= best + 1e-12
         assert certificate.bound >= best - 1e-12
         assert (np.bincount(counts.group[choice.rays], minlength=2) <= counts.most).all()
+
+    @settings(max_examples=60)
+    @given(
+        seed=seeds, harm=st.sampled_from([0.05, 0.5, 3.0]), price=st.sampled_from([0.0, 0.05]),
+        share=st.none() | st.floats(0.5, 1.2), owned=st.booleans(), most=st.integers(2, 9), banned=st.booleans(),
+    )  # fmt: skip
+    def test_that_fills_its_counts_is_bounded_as_all_that_do(
+        self, table, seed, harm, price, share, owned, most, banned
+    ):
+        coverage, owner = small(seed, table=table, harm=harm), np.array([0, 0, 1, 1, 1, 1, 1]) if owned else None
+        if banned:
+            coverage.bits[3:5] = np.inf
+        counts = RayCounts(np.zeros(7, dtype=int), np.array([most]), owner)
+        choice, budget = choose(coverage, counts, price=price), None
+        if share is not None:
+            budget = share * choice.bits
+            choice, price = choose_within(coverage, counts, budget), 0.0
+        fired = min(most, 7 - 2 * banned)
+        others = [gate for gate in every_choice(coverage, counts) if (gate >= 0).sum() == fired]
+        if len(choice.rays) < fired:
+            others = every_choice(coverage, counts)  # the budget has no room for more, as far as is known
+        elif owned and len(set(owner[choice.rays])) == 2:
+            others = [gate for gate in others if len(set(owner[gate >= 0])) == 2]
+        best = best_of_all(coverage, others, price, np.inf if budget is None else budget)
+        certificate = certify(coverage, counts, choice, budget_mbps=budget)
+        assert certificate.value <= best + 1e-6
+        assert certificate.bound >= best - 1e-9
 
     def test_has_room_in_the_bandwidth_that_its_rays_take_however_bits_are_added_up(self, table):
         coverage = small(0, table=table)
@@ -100,8 +127,8 @@ class TestAChoice:
         coverage, counts = small(seed, table=table), RayCounts.of_one(7, 3)
         budget = share * choose(coverage, counts).bits
         choice = choose_within(coverage, counts, budget, full=False)
-        best = best_of_all(coverage, counts, budget_mbps=budget)
-        certificate = certify(coverage, counts, choice, budget_mbps=budget)
+        best = best_of_all(coverage, every_choice(coverage, counts), budget_mbps=budget)
+        certificate = certify(coverage, counts, choice, budget_mbps=budget, full=False)
         assert choice.bits <= budget
         assert choice.worth <= best + 1e-12
         assert certificate.bound >= best - 1e-12
@@ -117,7 +144,8 @@ class TestAChoice:
                 if share
                 else choose(coverage, counts, price=price, full=False)
             )
-            ratios.append((choice.worth - price * choice.bits) / best_of_all(coverage, counts, price, budget))
+            best = best_of_all(coverage, every_choice(coverage, counts), price, budget)
+            ratios.append((choice.worth - price * choice.bits) / best)
         assert np.mean(ratios) >= 0.98
         assert min(ratios) >= 0.8
 
@@ -192,15 +220,38 @@ def test_where_no_ray_tells_anything_as_many_fire_as_fit(seed, spare):
     assert len(choose_within(coverage, RayCounts.of_one(len(coverage.bits), 3), budget).rays) == 3
 
 
+@given(seeds, st.integers(1, 6), st.floats(1e-3, 10))
+@example(200, 3, 10.0 ** np.random.default_rng(200).uniform(-3, 1))
+def test_a_budget_that_is_enough_for_rays_at_some_price_is_enough_for_as_many(seed, count, price):
+    coverage = small(seed, rays=20, gates=3, items=4)
+    counts = RayCounts(np.random.default_rng(seed).integers(0, 3, 20), np.array([count, 3, 3]))
+    known = choose(coverage, counts, price=price, passes=0)
+    assert len(choose_within(coverage, counts, known.bits).rays) == len(known.rays)
+
+
 @pytest.mark.parametrize("price", [0.0, 0.002])
 def test_certificates_are_near_the_linear_program_that_they_relax(price):
     coverage, counts = small(3, rays=40, items=30, scenes=4), RayCounts.of_one(40, 8)
     choice = choose(coverage, counts, price=price, full=False)
-    certificate = certify(coverage, counts, choice, rounds=3000)
+    certificate = certify(coverage, counts, choice, full=False, rounds=3000)
     linear, best = (relaxed_by_highs(coverage, 8, price, integral) for integral in (False, True))
     assert certificate.value <= best + 1e-6
     assert certificate.value >= 0.98 * best
     assert linear - 1e-6 <= certificate.bound <= 1.02 * linear
+
+
+@pytest.mark.parametrize("harm", [0.05, 0.3])
+def test_bounds_of_choices_that_fill_their_counts_charge_the_harm_that_rays_cannot_avoid(harm):
+    loose = []
+    for seed in range(8):
+        coverage, counts = small(seed, rays=40, items=30, scenes=4, harm=harm), RayCounts.of_one(40, 16)
+        choice = choose(coverage, counts, price=0.01)
+        best = relaxed_by_highs(coverage, 16, 0.01, True, full=True)
+        bounds = [certify(coverage, counts, choice, full=full).bound for full in (True, False)]
+        assert min(bounds) >= best - 1e-6
+        loose.append((np.array(bounds) - best) / (coverage.complete - best))
+    exact, unfired = np.median(loose, axis=0)
+    assert exact <= 0.01 < 0.1 <= unfired
 
 
 @given(seed=seeds)

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
+from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +18,14 @@ from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.fitting import part_design
 from lidardesign.fitting.part_sets import SetLimits, choose_set
 from lidardesign.fitting.part_shapes import COARSE_CELL_RAD, PartBundle, cells_of, part_table, parts_inform
-from lidardesign.parts.catalogue import find_part, part_rays
+from lidardesign.fitting.request import split_settings
+from lidardesign.parts.catalogue import FOLDER, find_part, load_library, part_rays
 from lidardesign.rays import information
 from lidardesign.samples import load_samples
 from lidardesign.sensors.design import certificates_of
 from lidardesign.sensors.design_file import design_document
+from lidardesign.simulate.detector.files import load_detector
+from lidardesign.simulate.detector.physics import Physics
 from lidardesign.simulate.returns import simulate_many
 from lidardesign.task import Information
 
@@ -72,6 +78,12 @@ class TestDesignsOfParts:
         away = np.mod(np.degrees([sensor.azimuth_rad for sensor in spec.sensors]) - bound, 360)
         assert (away <= 20 + 1e-6).all()
 
+    def test_are_upright_where_they_may_not_roll(self, run):
+        spec = bought(run, sensors=3, boresight={"roll_deg": {"min": 0, "max": 0}})
+        assert [sensor.roll_rad for sensor in spec.sensors] == pytest.approx([0.0] * len(spec.sensors))
+        with pytest.raises(InfeasibleError, match="plane"):
+            bought(run, boresight={"roll_deg": {"min": 5}})
+
     def test_keep_a_bandwidth_and_a_number_of_rays(self, run):
         spec = bought(run, budget={"rays": 30, "bandwidth_mbps": 10.0})
         assert spec.count == 30
@@ -92,6 +104,118 @@ class TestDesignsOfParts:
         )
         assert len(fitted.specification.sensors) <= 2
         assert any("tmf8828" in note and "left out" in note for note in notes)
+
+
+ASKED = {"parts": ["vl53l5cx", "tmf8820"], "sensors": 2}
+LIGHT = {"detector": "consumer-8x8", "settings": ["illuminance_lux=100000"]}
+
+
+class TestTheWorldAsItIs:
+    def test_is_recorded_and_asked_for_again(self, run):
+        first = open_run(run).fit(**ASKED, **LIGHT, name="bright")
+        assert first.specification.provenance["world"] == {
+            "detector": "consumer-8x8",
+            "set": ["illuminance_lux=100000"],
+        }
+        again = first.constrain(parts=ASKED["parts"], sensors=2, name="bright").specification
+        assert design_document(again)["patterns"] == design_document(first.specification)["patterns"]
+        assert again.provenance["world"] == first.specification.provenance["world"]
+        dark = first.constrain(parts=ASKED["parts"], sensors=2, detector="ideal", settings=["illuminance_lux=0"])
+        assert dark.specification.provenance["world"] == {"detector": "ideal", "set": ["illuminance_lux=0"]}
+
+    def test_is_judged_by_effects_that_a_line_names_with_what_the_others_could_change(self, run):
+        notes = []
+        open_run(run).fit(**ASKED, **LIGHT, name="bright", notes=notes.append)
+        (line,) = [note for note in notes if note.startswith("judged under consumer-8x8")]
+        assert "photon_noise" in line
+        assert "multipath" not in line
+        assert "could change" in line
+
+    def test_takes_the_set_with_the_best_score(self, run, monkeypatch):
+        """Whatever the proxy says: the scores are turned round, and the worst of the sets is taken."""
+        tried = []
+
+        def score(self, trials, count):
+            tried[:] = trials if len(trials) > 1 else tried
+            for trial in trials:
+                order = trials.index(trial) if len(trials) > 1 else 0
+                trial.scores = np.append(trial.scores, np.full(count - len(trial.scores), 100.0 - order))
+            self.scenes = self.training.first("held back")
+
+        monkeypatch.setattr(part_design.HeldBackScenes, "score", score)
+        spec = open_run(run).fit(**ASKED, name="last").specification
+        assert spec.sensors == tried[-1].design.sensors
+        (certificate,) = certificates_of(spec)
+        assert certificate["bound"] <= certificate["value"]
+
+    @pytest.mark.parametrize(
+        ("words", "settings"),
+        [
+            (["gate.end_m.max=1"], 0),
+            (["illuminance_lux=0", "gate.end_m.max=1", "light=sun"], 2),
+            (["gaet.end_m.max=1"], 0),
+        ],
+    )
+    def test_has_the_keys_of_the_task_beside_those_of_constraints(self, run, words, settings):
+        bounds, own = split_settings(words, open_run(run).task)
+        assert len(own) == settings
+        assert sorted([*bounds, *own]) == sorted(words)
+
+    def test_cannot_change_what_was_learned(self, run):
+        with pytest.raises(ConfigError, match=r"learned|space"):
+            open_run(run).fit(**ASKED, settings=["sigma_m=0.1"])
+
+    def test_of_commands_is_that_of_python(self, lidardesign, run):
+        options = ["--set", "illuminance_lux=100000", "--detector", "consumer-8x8", "--json"]
+        parts = ["--parts", ",".join(ASKED["parts"]), "--sensors", 2, "--name", "bright"]
+        done = lidardesign("fit", run, *parts, *options)
+        assert done.code == 0, done.err
+        done = lidardesign("constrain", run, *parts, *options, "--set", "parts.each.tmf8820.max=2", "--name", "again")
+        assert done.code == 0, done.err
+        worlds = [open_run(run).designs()[n].specification.provenance["world"] for n in (0, 1)]
+        assert worlds[0] == worlds[1] == {"detector": "consumer-8x8", "set": ["illuminance_lux=100000"]}
+
+
+def priced(folder, name, price, **figures):
+    """A copy of a shipped part with a price, or without."""
+    text = (FOLDER / f"{name}.yaml").read_text()
+    path = folder / f"my-{name}.yaml"
+    path.write_text(text if price is None else f"{text}\nprice: [{{value: {price}, source: datasheet}}]\n")
+    return str(path)
+
+
+class TestPrices:
+    def test_are_summed_bounded_and_left_out_where_they_are_unknown(self, run, tmp_path):
+        own = [priced(tmp_path, "vl53l5cx", 10.0), priced(tmp_path, "tmf8820", None)]
+        notes = []
+        rules = {"parts": {"price": {"max": 25}}}
+        spec = open_run(run).fit(parts=own, sensors=3, constraints=rules, name="cheap", notes=notes.append)
+        names = [sensor.part for sensor in spec.specification.sensors]
+        assert names == ["my-vl53l5cx"] * 2
+        assert any("price of my-tmf8820" in note for note in notes)
+        assert any("cost 20" in note for note in notes)
+        document, rules = design_document(spec.specification), {"parts": {"names": own, "price": {"max": 19}}}
+        assert [check.satisfied for check in check_design(document, rules)][-1] is False
+
+    def test_that_nobody_knows_cannot_be_bounded(self, run):
+        with pytest.raises(InfeasibleError, match="price of any"):
+            bought(run, parts={"price": {"max": 40}})
+
+
+class TestNumbersOfParts:
+    def test_are_a_table_whose_best_is_the_design(self, run):
+        fitted = open_run(run).fit(parts=THREE, sensors="1-3", name="table")
+        rows = fitted.as_dict()["numbers"]
+        assert [row["sensors"] for row in rows] == list(range(1, len(rows) + 1))
+        assert all(sum(row["parts"].values()) == row["sensors"] for row in rows)
+        best = min(rows, key=lambda row: row["score"])
+        assert len(fitted.specification.sensors) == best["sensors"]
+        assert Counter(sensor.part for sensor in fitted.specification.sensors) == best["parts"]
+
+    @pytest.mark.parametrize(("options", "words"), [({"sensors": "1-3"}, "without parts"), ({"sensors": "3-1"}, "1-4")])
+    def test_are_for_parts_and_ascend(self, run, options, words):
+        with pytest.raises(ConfigError, match=words):
+            open_run(run).fit(**options)
 
 
 @pytest.mark.parametrize(
@@ -172,19 +296,33 @@ def test_cells_hold_directions_that_are_near():
         assert (own @ own.T).min() > np.cos(1.6 * COARSE_CELL_RAD)
 
 
-def test_a_part_tells_what_its_own_rays_would(run):
+ZONES = replace(load_detector("consumer-8x8"), bins=None)
+
+
+@pytest.mark.parametrize("detector", [None, ZONES], ids=["lines", "zones"])
+def test_a_part_tells_what_its_own_rays_would(run, detector):
     opened = open_run(run)
     parts = [find_part(name) for name in THREE]
     placed = part_design.proposed(parts, part_design.Constraints(), load_samples(run), 0)
     scene = opened.task.scenes(opened.config.task, "train", 0)[0]
-    coverage = part_table(parts_inform(PartBundle(placed, 64, 1), [scene], every_return, 2, 0), len(placed))
+    bundle = PartBundle(placed, 64, 1, detector)
+    coverage = part_table(parts_inform(bundle, [scene], every_return, 2, 0), len(placed))
     for number in range(0, len(placed), 7):
         one = placed[number]
         rays = part_rays(one.part, one.pose)
-        ((returns,),) = simulate_many(scene, [rays])
+        own = detector and replace(detector, divergence_rad=one.part.beam_rad, footprint_rays=4)
+        ((returns,),) = simulate_many(scene, [rays], physics=own and Physics(own, frozenset({"footprint"})))
         told = every_return(scene, [returns])
         gate = np.full(len(placed), -1)
         gate[number] = 0
         exact = len(np.unique(told.item)) / 10
         assert coverage.value_of(gate) == pytest.approx(exact, abs=0.11)
     assert choose_set(coverage, SetLimits(2)).value <= 1
+
+
+def test_the_zones_of_a_part_fill_its_field():
+    for part in load_library().every_mode():
+        if part.pattern.kind == "zones":
+            assert part.beam_rad**2 * part.rays == pytest.approx(math.prod(part.field_of_view_rad))
+        elif part.value("divergence_mrad") is None:
+            assert part.beam_rad == 0

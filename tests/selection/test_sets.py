@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from support.coverages import SUMS, relaxed_by_highs, small
 
 from lidardesign.fitting import part_sets as sets
-from lidardesign.fitting.part_sets import SetLimits, choose_set
+from lidardesign.fitting.part_sets import SetLimits, choose_set, further_sets
 from lidardesign.rays.coverage import LARGEST
 
 seeds = st.integers(0, 10_000)
@@ -87,3 +87,21 @@ def test_the_best_set_is_that_of_a_solver(seed):
 def test_no_candidate_that_tells_nothing_is_taken():
     coverage = candidates(0, 4).grouped([np.array([], dtype=int), np.array([0]), np.array([], dtype=int)])
     assert choose_set(coverage, SetLimits(3)).members == (1,)
+
+
+@pytest.mark.parametrize("table", [LARGEST, SUMS], ids=["largest", "sums"])
+@given(seed=seeds, most=st.integers(1, 8))
+def test_further_sets_are_distinct_and_keep_the_limits(table, seed, most):
+    coverage, limits = candidates(seed, 9, table), random_limits(seed, 9)
+    chosen = choose_set(coverage, limits)
+    found = further_sets(coverage, limits, chosen.members, most)
+    assert found[0] == chosen.members
+    assert len({tuple(sorted(members)) for members in found}) == len(found) <= most
+    assert all(keeps(limits, members) and value_of(coverage, members) <= chosen.bound * (1 + 1e-9) for members in found)
+
+
+def test_further_sets_have_those_of_a_kind_alone():
+    coverage, kind = candidates(0, 12), np.repeat([0, 1, 2], 4)
+    limits = SetLimits(2, [(kind, np.full(3, 2))])
+    found = further_sets(coverage, limits, choose_set(coverage, limits).members, 8)
+    assert {0, 1, 2} <= {kind[members[0]] for members in map(list, found) if len(set(kind[members])) == 1}

@@ -26,7 +26,7 @@ def found(counts, *, known=0.0, false_alarm=0.01, matched=True, sigma=SIGMA, hal
 def found_corrected(counts, *, matched=True, false_alarm=0.01, pulses, dead, period=1e6):
     counts = np.asarray(counts, np.int64)
     offset, known = np.array([0, len(counts)]), np.array([0.0])
-    times = float(pulses), dead, period
+    times = np.array([float(pulses)]), dead, period
     return find_corrected(counts, offset, WHOLE, 1.0, SIGMA, HALF, known, false_alarm, matched, *times)[0]
 
 

@@ -39,6 +39,7 @@ CONTRADICTIONS = {
     ),
     "beyond the space": ({"gate": {"start_m": {"min": 2.0}}}, ["gate.start_m.min", "space.range_m"]),
     "wider than the space": ({"gate": {"width_m": {"min": 2.0}}}, ["gate.width_m.min", "space.range_m"]),
+    "roll": ({"boresight": {"roll_deg": {"min": 10, "max": 5}}}, ["boresight.roll_deg.min", "boresight.roll_deg.max"]),
     "elevation": (
         {"boresight": {"elevation_deg": {"min": 10, "max": 5}}},
         ["boresight.elevation_deg.min", "boresight.elevation_deg.max"],

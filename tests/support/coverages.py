@@ -36,14 +36,14 @@ def small(seed, rays=7, gates=2, items=12, scenes=3, table=LARGEST, harm=0.0):
     return Coverage(**{**vars(coverage), "harm": harm * generator.uniform(0, 1, coverage.shape)})
 
 
-def relaxed_by_highs(coverage, count, price, integral):
-    """The facility location problem of one sensor as a program: rays' gates x, and who serves each item y <= x."""
+def relaxed_by_highs(coverage, count, price, integral, *, full=False):
+    """At most `count` rays of one sensor, or so many, as a program: gates x, and who serves each item y <= x."""
     rays, gates = coverage.shape
     ray_of = coverage.ray
     pairs = [(e, g) for e in range(len(coverage.item)) for g in range(gates) if coverage.gates[e] >> g & 1]
     chosen, served = rays * gates, len(pairs)
     gain = [-float(coverage.weight[coverage.item[e]] * coverage.worth[e]) for e, _ in pairs]
-    cost = np.concatenate([(price * coverage.bits).ravel(), gain])
+    cost = np.concatenate([(price * coverage.bits + coverage.harm).ravel(), gain])
     rows, columns, values = [], [], []
     for n, (e, g) in enumerate(pairs):
         rows += [n, n]
@@ -65,5 +65,6 @@ def relaxed_by_highs(coverage, count, price, integral):
     most = np.concatenate([np.zeros(served), np.ones(items + rays), [count]])
     matrix = coo_array((values, (rows, columns)), shape=(last + 1, chosen + served)).tocsr()
     whole = np.concatenate([np.full(chosen, int(integral)), np.zeros(served)])
-    result = milp(cost, constraints=LinearConstraint(matrix, -np.inf, most), bounds=Bounds(0, 1), integrality=whole)
+    least = np.where(np.arange(last + 1) == last, count if full else 0, -np.inf)
+    result = milp(cost, constraints=LinearConstraint(matrix, least, most), bounds=Bounds(0, 1), integrality=whole)
     return -float(result.fun)

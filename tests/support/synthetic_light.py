@@ -8,6 +8,7 @@ from lidardesign.scenes.scene import Body, Scene, Sphere
 from lidardesign.simulate.detection import ArrivingLight, count_photons, detect
 from lidardesign.simulate.detector.light import Background, Echoes
 from lidardesign.simulate.detector.physics import Detector, Photons, Physics
+from support.rays import rays_along
 
 WAVELENGTH_M = 905e-9
 PULSES = 1000
@@ -30,7 +31,7 @@ def counting_detector(rays: int, *, pulses: int = PULSES, dead_s: float = 0.0, r
         dark_hz=0.0,
         dead_s=dead_s,
     )
-    aperture_m2 = 1 / (pulses * photons.emitted(rays))
+    aperture_m2 = 1 / (pulses * float(photons.emitted(rays)))
     photons = Photons(**{**photons.__dict__, "aperture_m2": aperture_m2})
     return Detector("synthetic", photons=photons, **timing)
 
@@ -55,13 +56,19 @@ def background(rays: int, per_metre: float = 0.0) -> Background:
     return Background(np.full(rays, float(per_metre)))
 
 
+def one_sensor(windows_m):
+    return rays_along(np.tile([1.0, 0.0, 0.0], (len(windows_m), 1)), windows_m)
+
+
 def counted(windows_m, echoes, light, detector, effects, seed: int = 0):
     """Counts per bin, shape (N, B), of rays whose windows have equally many bins, and the bins."""
     physics = Physics(detector, frozenset(effects), seed)
-    whole = ArrivingLight.of(windows_m, echoes, light, physics)
+    whole = ArrivingLight.of(one_sensor(windows_m), windows_m, echoes, light, physics)
     counts = count_photons(SCENE, 0, whole, physics)
     return counts.reshape(len(windows_m), -1), whole.bins
 
 
 def detected(windows_m, echoes, light, detector, effects, seed: int = 0):
-    return detect(SCENE, 0, windows_m, echoes, light, Physics(detector, frozenset(effects), seed))
+    return detect(
+        SCENE, 0, one_sensor(windows_m), windows_m, echoes, light, Physics(detector, frozenset(effects), seed)
+    )

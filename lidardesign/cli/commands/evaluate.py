@@ -174,6 +174,7 @@ def evaluate(
             show_default=False,
         ),
     ] = None,
+    losses: options.Losses = False,
     seed: options.Seed = None,
     scenes_seed: Annotated[
         int | None,
@@ -211,6 +212,7 @@ def evaluate(
             scenes_seed=scenes_seed,
             designs=designs or (),
             mount_error=mount_error,
+            losses=losses,
             fail_above=fail_above,
             fail_unless_better=fail_unless_better,
         )

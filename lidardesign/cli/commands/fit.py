@@ -36,6 +36,9 @@ def fit(
     name: options.Name = "fit",
     seed: options.Seed = None,
     certify: options.Certify = False,
+    detector: options.Judge = None,
+    overrides: options.SceneSettings = None,
+    survive: options.Survive = None,
     goal: options.Goal = None,
     least: options.Least = None,
     workers: options.Workers = "1",
@@ -63,6 +66,9 @@ def fit(
             name=name,
             seed=seed,
             certify=certify,
+            detector=detector,
+            settings=overrides or (),
+            survive=survive,
             goal=goal,
             least=least,
         )
@@ -111,7 +117,7 @@ def constrain(
         typer.Option(
             "--set",
             metavar="KEY=VALUE",
-            help="One constraint: gate.width_m.max=0.1; repeatable.",
+            help="One constraint: gate.width_m.max=0.1, or a key of the task as for `fit`; repeatable.",
             show_default=False,
             autocompletion=constraint_keys,
         ),
@@ -129,6 +135,8 @@ def constrain(
     name: options.Name = "constrained",
     seed: options.Seed = None,
     certify: options.Certify = False,
+    detector: options.Judge = None,
+    survive: options.Survive = None,
     goal: options.Goal = None,
     least: options.Least = None,
     workers: options.Workers = "1",
@@ -140,12 +148,15 @@ def constrain(
     with command(json=json, quiet=quiet, verbose=verbose) as output:
         with phase("libraries"):
             from lidardesign.constraints.document import Constraints
-            from lidardesign.fitting.request import FitOptions, FitRequest, load_constraints
+            from lidardesign.fitting.request import FitOptions, FitRequest, load_constraints, split_settings
             from lidardesign.formats.designs import need_run, open_target
 
+        opened, design = open_target(target, output.remark)
+        run = need_run(opened, target)
+        bounds, settings = split_settings(overrides or (), run.task)
         chosen = FitOptions(
             sensors=options.sensor_count(sensors),
-            constraints=load_constraints(constraints, overrides or (), output.remark) or Constraints(),
+            constraints=load_constraints(constraints, bounds, output.remark) or Constraints(),
             layout=layout,
             rays=rays,
             channels=channels,
@@ -158,8 +169,10 @@ def constrain(
             name=name,
             seed=seed,
             certify=certify,
+            detector=detector,
+            settings=settings,
+            survive=survive,
             goal=goal,
             least=least,
         )
-        run, design = open_target(target, output.remark)
-        run_fit(FitRequest.resolve(need_run(run, target), chosen, design, notes=output.remark), output, workers)
+        run_fit(FitRequest.resolve(run, chosen, design, notes=output.remark), output, workers)

@@ -76,6 +76,13 @@ def show(
         for line in () if space is None else outside_notes(specification, space):
             output.remark(line)
         specification = shown[0]
+        reaches = []
+        if any(sensor.part for sensor in specification.sensors):
+            from lidardesign.simulate.calibration import reach_notes, reaches_of
+
+            reaches = [vars(one) for one in reaches_of(specification)]
+            for line in reach_notes(specification):
+                output.remark(line)
         readout = readout_of(specification)
         document = {
             "design": str(design),
@@ -86,6 +93,7 @@ def show(
             "at": dict(specification.at),
             "frame": specification.mount or "world",
             "sensors": [sensor.as_dict() for sensor in specification.sensors],
+            "reaches": reaches,
             "patterns": [pattern_document(pattern) for pattern in specification.patterns],
             "constraints": specification.constraints,
             "checks": [

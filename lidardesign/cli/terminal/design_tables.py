@@ -120,6 +120,10 @@ def _condition(design: DesignSpec) -> str:
 def _poses(design: DesignSpec) -> tuple[str, list[dict[str, str]]]:
     """The place of a design in words, and the table cells of its sensors; without origins where all share one."""
     cells = [sensor.as_text() for sensor in design.sensors]
+    if any(sensor.part for sensor in design.sensors):
+        from lidardesign.simulate.calibration import reaches_of
+
+        cells = [cell | reach.as_text() for cell, reach in zip(cells, reaches_of(design), strict=True)]
     if len({cell["origin [m]"] for cell in cells}) > 1:
         return f"in {design.frame}", cells
     rest = [{name: text for name, text in cell.items() if name != "origin [m]"} for cell in cells]

@@ -152,8 +152,8 @@ Sensors = Annotated[
     str | None,
     typer.Option(
         "--sensors",
-        metavar="N|best",
-        help="Number of sensors; best: by the task's score on training scenes.",
+        metavar="N|N-M|best",
+        help="Number of sensors; best: by the task's score on training scenes; N-M: of parts, a table and its best.",
         show_default="the design's, else best",
     ),
 ]
@@ -165,6 +165,22 @@ Parts = Annotated[
         help="Make the design of real parts (catalog names, NAME:MODE, part files), chosen with their poses; "
         "--sensors says how many.",
         show_default=False,
+    ),
+]
+Judge = Annotated[
+    str | None,
+    typer.Option(
+        "--detector",
+        metavar="NAME|FILE",
+        help="Judge sets of parts and numbers of sensors under a detector (see `evaluate`).",
+        show_default="ideal",
+        autocompletion=detectors,
+    ),
+]
+SceneSettings = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set", metavar="KEY=VALUE", help="A key of the task: choose in other scenes than were learned; repeatable."
     ),
 ]
 Weights = Annotated[
@@ -192,6 +208,11 @@ Certify = Annotated[
         "--certify", help="Bound what any other choice could gain at every number of rays, not the middle one."
     ),
 ]
+Survive = Annotated[
+    int | None,
+    typer.Option("--survive", metavar="0|1", help="1: choose for the loss of any one sensor.", show_default="0"),
+]
+Losses = Annotated[bool, typer.Option("--losses", help="Also score designs with each of their sensors lost.")]
 Goal = Annotated[
     float | None,
     typer.Option("--goal", metavar="SCORE", help="Score to keep, by the least that it takes.", show_default=False),

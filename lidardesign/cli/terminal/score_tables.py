@@ -50,6 +50,8 @@ def _show_designs(document: Entry, evaluation: Evaluation, rich: RichConsole) ->
         "failures": [str(row["failures"]) for row in shown],
         "Mbit/s": [number(row["bandwidth_mbps"], 3) for row in shown],
     }
+    if any("lost" in row for row in shown):
+        columns["worst sensor lost"] = [number(row.get("worst_lost")) for row in shown]
     counts = {row.rays for row in rows.values()}
     if len(counts) == 1:
         del columns["rays"]
@@ -127,11 +129,13 @@ def _show_rows(document: Entry, rich: RichConsole) -> None:
     title = f"{metric['name']} [{metric['unit']}], {metric['better']} is better, over {_scenes(document)}"
     details = [name for row in rows for name in row["details"]][:1]
     further = [name.replace("_", " ") for name in details]
-    headings = ("design", "rays", "value", "95 % interval", "failures", *further, "Mbit/s", "seconds")
+    worst = {"worst_decile": "worst tenth", "worst_lost": "worst lost"}
+    worst = {name: heading for name, heading in worst.items() if any(name in row for row in rows)}
+    headings = ("design", "rays", "value", "95 % interval", *worst.values(), "failures", *further, "Mbit/s", "seconds")
     lines = []
     for row in rows:
-        extra = [row["details"].get(name) for name in details]
-        cells = (row["rays"], *value_cells(row), row["failures"], *extra, row["bandwidth_mbps"])
+        extra = [*map(row.get, worst), row["failures"], *map(row["details"].get, details)]
+        cells = (row["rays"], *value_cells(row), *extra, row["bandwidth_mbps"])
         lines.append([row["design"], *(number(cell) for cell in cells), number(row["seconds"], 2)])
     print_table(title, headings, lines, rich)
     places = [(row["design"], row["rays"], f"seed {seed}") for row in rows for seed in document.get("seeds", [])]

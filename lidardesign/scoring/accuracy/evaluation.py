@@ -131,7 +131,7 @@ def _rays(asked: EvaluationRequest, design: DesignSpec) -> tuple[int, RaysPerCon
         conditions = conditions_of(asked.task, asked.config, asked.space)
     each = len(conditions) * asked.test[0].frames
     count = max([one for one in counts if one * each <= RAYS_PER_SCENE], default=counts[0])
-    return count, tuple(design.rays(count, at=condition or None) for condition in conditions)
+    return count, tuple(asked.fired(design, count, condition) for condition in conditions)
 
 
 def _paired(values: np.ndarray, reference: np.ndarray) -> tuple[float, float]:
@@ -316,7 +316,7 @@ def _measure_scenes(differences: np.ndarray, count: int, seconds: float, seed: i
     generator = random_generator(seed, "held-out ladder", count)
     draws = DRAWS if count < total else 1
     sets = [generator.permutation(total)[:count] for _ in range(draws)] if count < total else [np.arange(total)]
-    intervals = [mean_interval(differences[chosen], seed, resamples=1000) for chosen in sets]
+    intervals = [mean_interval(differences[chosen]) for chosen in sets]
     halves = np.array([(one.high - one.low) / 2 for one in intervals])
     sign = np.sign(differences.mean())
     agree = np.mean([sign * one.low > 0 and sign * one.high > 0 for one in intervals])

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -147,7 +147,9 @@ class MovableSensors:
         if axes.vertical:
             sides[..., ELEVATION] = bounds.elevation_low - self._aim[:, 1], bounds.elevation_high - self._aim[:, 1]
         if axes.angular == 2:
-            sides[..., ROLL] = np.array([-math.pi, math.pi])[:, None]
+            rolls = np.stack([bounds.roll_low, bounds.roll_high])
+            is_bounded = np.ptp(rolls, axis=0) < math.pi / 2
+            sides[..., ROLL] = np.where(is_bounded, rolls - self._aim[:, 2], np.array([[-math.pi], [math.pi]]))
         wide = np.array([axes.horizontal, axes.vertical]) & (spread > 0)
         widest = np.minimum(bounds.spread_high * [axes.angle_scale, 1.0], math.pi / 2 / bounds.interval)
         ends = np.stack([bounds.spread_low * [axes.angle_scale, 1.0], widest]) / np.where(wide, spread, 1.0)
@@ -196,7 +198,8 @@ class MovableSensors:
         gate_m = np.stack([middle - half, middle + half], axis=1)
         varied = own[:, GATE].any(axis=1, keepdims=True)
         gate_m = np.where(varied, admitted_gates(gate_m, rows), rays.gate_m) if varied.any() else rays.gate_m
-        return Rays(rays.origin_m + own[:, ORIGIN], direction(azimuth, elevation), gate_m, sensor, rays.time_s)
+        looking = direction(azimuth, elevation)
+        return replace(rays, origin_m=rays.origin_m + own[:, ORIGIN], direction=looking, gate_m=gate_m, angles_rad=None)
 
     def excess(self, positions: RaysPerCondition) -> float:
         """The share by which the bandwidth of rays exceeds the design's; 0 where it does not."""

@@ -26,7 +26,7 @@ from lidardesign.scoring.baselines.greedy import GREEDY, USUAL_SCENES, Fired, Gr
 from lidardesign.scoring.baselines.simple import Baselines, Option, TwinCandidate
 from lidardesign.scoring.baselines.views import TrainingObjective, TrainingViews
 from lidardesign.scoring.evaluation.request import EvaluationRequest, fired_numbers, numbers_fired
-from lidardesign.scoring.scene_scores import RaysPerCondition, score_scenes
+from lidardesign.scoring.scene_scores import ONE_DEVICE, Devices, RaysPerCondition, score_scenes
 from lidardesign.sensors.bandwidth import Bandwidth, mean_mbps
 from lidardesign.sensors.design import DesignSpec, certificates_of
 from lidardesign.simulate.detector.physics import EFFECTS
@@ -55,6 +55,7 @@ class Entry:
         redraw: Gives the rays of a scene, for layouts drawn anew in each.
         matched_to, matched_rays: The design and its number of rays whose bandwidth this baseline was given.
         search: The record of a direct search for its rays.
+        devices: Devices of a baseline, those of the design that it stands beside.
     """
 
     name: str
@@ -64,6 +65,7 @@ class Entry:
     matched_to: str | None = None
     matched_rays: int | None = None
     search: cma.SearchRecord | None = None
+    devices: Devices = ONE_DEVICE
 
     @property
     def rays(self) -> int:
@@ -78,13 +80,17 @@ class Entry:
         """The rays that it fires in a held-out scene."""
         return self.positions if self.redraw is None else self.redraw(scene)
 
+    def lit_in(self, scene: int) -> RaysPerCondition:
+        """The rays that it fires in a held-out scene, each with its device's light."""
+        return self.devices.firing(self.rays_in(scene))
+
     @cached_property
     def key(self) -> tuple[Any, ...]:
         """A key that is equal for entries that fire the same rays."""
         if not self.baseline:
             return ("design", self.name, self.rays)
         arrays = (array for rays in self.positions for array in (rays.origin_m, rays.direction, rays.gate_m))
-        return (self.name, *(array.tobytes() for array in arrays))
+        return (self.name, self.devices, *(array.tobytes() for array in arrays))
 
 
 @phase("rays")
@@ -105,11 +111,13 @@ def entries_of(request: EvaluationRequest) -> list[Entry]:
     shared = [count for count in counts if count not in request.alone]
     choosable = [] if request.training is None else greedy_rays(request.task, len(conditions), shared)[0]
     starts = {one.rays: one.positions for one in designs if one.name == request.designs[0].name}
+    # beside several designs a baseline has as many devices as the one with the most
+    devices = max((Devices.of(one.positions) for one in designs), key=lambda one: one.number, default=ONE_DEVICE)
     baselines = Baselines(
         request.space,
         request.train,
         request.seed,
-        partial(_judge, request),
+        partial(_judge, request, devices),
         conditions=conditions,
         gates_per_ray=any(design.has_gates_per_ray for design in request.designs),
         without_visibility=partial(_twin, request, conditions, designs) if request.without_visibility else None,
@@ -135,7 +143,8 @@ def entries_of(request: EvaluationRequest) -> list[Entry]:
     wanted = [one for one in wanted if one[1]]
     chosen = baselines.best([(name, options) for name, options, _ in wanted])
     return designs + [
-        _entry(baselines, name, option, matched) for (name, _, matched), option in zip(wanted, chosen, strict=True)
+        _entry(baselines, name, option, matched, devices if matched is None else Devices.of(matched.positions))
+        for (name, _, matched), option in zip(wanted, chosen, strict=True)
     ]
 
 
@@ -154,7 +163,7 @@ def _check_ends(request: EvaluationRequest, conditions: Sequence[Mapping[str, fl
             )
 
 
-def _entry(baselines: Baselines, name: str, option: Option, matched: Entry | None) -> Entry:
+def _entry(baselines: Baselines, name: str, option: Option, matched: Entry | None, devices: Devices) -> Entry:
     candidate, count = option.candidate, len(option.positions[0])
     searched = matched is None and isinstance(candidate, cma.CmaCandidate)
     return Entry(
@@ -165,6 +174,7 @@ def _entry(baselines: Baselines, name: str, option: Option, matched: Entry | Non
         matched_to=None if matched is None else matched.name,
         matched_rays=None if matched is None else matched.rays,
         search=candidate.record_of(option.positions) if searched else None,
+        devices=devices,
     )
 
 
@@ -181,7 +191,7 @@ def ordered_conditions(request: EvaluationRequest) -> list[dict[str, float]]:
 def _laid_out(
     request: EvaluationRequest, conditions: Sequence[Mapping[str, float]], design: DesignSpec, count: int
 ) -> RaysPerCondition:
-    return tuple(design.rays(count, at=condition or None) for condition in conditions)
+    return tuple(request.fired(design, count, condition) for condition in conditions)
 
 
 def _twin(request: EvaluationRequest, conditions: Sequence[Mapping[str, float]], designs: Sequence[Entry]) -> Candidate:
@@ -228,13 +238,13 @@ def _chosen(
     )
 
 
-def _judge(request: EvaluationRequest, lists: Sequence[RaysPerCondition]) -> list[float]:
+def _judge(request: EvaluationRequest, devices: Devices, lists: Sequence[RaysPerCondition]) -> list[float]:
     """The mean score of sets of rays on a few training scenes, turned so that lower is better."""
     scenes = request.train[:JUDGED_SCENES]
     objective = TrainingObjective(request.task, request.metric, scenes, request.planner, request.seed)
     if not objective.scenes:
         return [0.0] * len(lists)
-    return objective.values(lists).mean(axis=0).tolist()
+    return objective.values(list(map(devices.firing, lists))).mean(axis=0).tolist()
 
 
 @phase("strongest baseline")
@@ -252,7 +262,7 @@ def strongest_baseline(request: EvaluationRequest, entries: Sequence[Entry], ray
     fired = sum(entry.rays for entry in entries) * len(request.test)
     affordable = int(LARGEST_BASELINE_SHARE * fired / (rays * len(baselines)))
     scenes = held_back_scenes(request, min(max(affordable, FEWEST_BASELINE_SCENES), MOST_BASELINE_SCENES))
-    scene_pass = request.scene_pass(lambda number: [entry.rays_in(number) for entry in baselines], request.planner)
+    scene_pass = request.scene_pass(lambda number: [entry.lit_in(number) for entry in baselines], request.planner)
     found = score_scenes(replace(scene_pass, scenes=scenes))
     means = np.mean([[score.value for score, _ in scene.scores] for scene in found], axis=0).tolist()
     values = dict(zip((entry.name for entry in baselines), means, strict=True))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -16,6 +16,7 @@ from lidardesign.errors import ConfigError, PluginError
 from lidardesign.rays.training import TrainingScenes
 from lidardesign.registry import plugin_guard
 from lidardesign.samples import Samples
+from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Scene
 from lidardesign.scoring.baselines.cma import CmaSettings
 from lidardesign.scoring.baselines.simple import ALWAYS, BASELINES, check_baseline
@@ -23,6 +24,7 @@ from lidardesign.scoring.evaluation.mounting import MountError
 from lidardesign.scoring.scene_scores import RaysPerCondition, ScenePass
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design import DesignSpec
+from lidardesign.simulate.calibration import with_part_light
 from lidardesign.simulate.plan import EffectPlan, Planner
 from lidardesign.space import DesignSpace
 from lidardesign.task import Metric, Task, metric_of, mount_of
@@ -40,7 +42,7 @@ class EvaluationRequest:
         task: The task that scores.
         config: The task's configuration; its condition values are evaluated at.
         space: The design space that baselines fill.
-        seed: Root of the drawn baselines and the bootstrap.
+        seed: Root of the drawn baselines.
         designs: The designs, by distinct names that are no baseline's.
         rays: Numbers of rays per frame; with conditions, per condition value. See `numbers_fired`.
         baselines: Names of baselines.
@@ -55,6 +57,7 @@ class EvaluationRequest:
         planner: The detector, and how the effects that are simulated are chosen.
         audit: Whether all rows are scored under all effects too.
         mount_error: Mounting errors of sensors in further rows; None: there are none.
+        losses: Whether all designs are scored with each of their sensors lost, not those alone that are made for it.
         starmap: How held-out scenes are scored: in this process, or by workers, to the same numbers.
         scenes_seed: Root of the held-out scenes; None: `seed`.
         alone: Those numbers of rays at which fixed patterns are evaluated without baselines and other designs.
@@ -78,6 +81,7 @@ class EvaluationRequest:
     planner: Planner = field(default_factory=Planner)
     audit: bool = False
     mount_error: MountError | None = None
+    losses: bool = False
     starmap: Starmap = itertools.starmap
     scenes_seed: int | None = None
     alone: Sequence[int] = ()
@@ -92,6 +96,12 @@ class EvaluationRequest:
         """The meaning of scores."""
         with plugin_guard(self.task.name):
             return metric_of(self.task, self.config)
+
+    @property
+    def losing(self) -> dict[str, int]:
+        """The numbers of sensors of designs that are scored with each of them lost, by the designs' names."""
+        own = [design for design in self.designs if self.losses or design.constraints.get("survive")]
+        return {design.name: len(design.sensors) for design in own}
 
     def check(self) -> None:
         """Refuse an invalid request.
@@ -119,6 +129,10 @@ class EvaluationRequest:
             check_baseline(name, where="--baseline")
         if any(count < 1 for count in self.rays):
             raise ConfigError(f"{min(self.rays)} rays", where="--rays", allowed="1 or more")
+
+    def fired(self, design: DesignSpec, count: int, at: Mapping[str, float]) -> Rays:
+        """The rays of a design at condition values, with the light that the detector has in its parts."""
+        return with_part_light(design.rays(count, at=at or None), design, self.planner.detector)
 
     def scene_pass(
         self, fired: Callable[[int], Sequence[RaysPerCondition]], planner: Planner, plans: Sequence[EffectPlan] = ()

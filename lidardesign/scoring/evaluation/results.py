@@ -21,7 +21,7 @@ from lidardesign.estimates import HALF_INTERVAL, Estimate, as_documents
 from lidardesign.run.files import write_atomic
 from lidardesign.scoring.evaluation.entries import EffectSummary
 from lidardesign.scoring.evaluation.mounting import MountError
-from lidardesign.scoring.statistics import paired_difference
+from lidardesign.scoring.statistics import Interval, paired_difference
 from lidardesign.scoring.sweep import Accuracy
 from lidardesign.task import Metric
 
@@ -30,7 +30,8 @@ if TYPE_CHECKING:
     from lidardesign.scoring.evaluation.entries import StrongestBaseline
 
 ROW_KEYS = (
-    "design", "rays", "value", "ci_low", "ci_high", "half_width", "failures", "bandwidth_mbps", "seconds",
+    "design", "rays", "value", "ci_low", "ci_high", "half_width", "worst_decile", "failures", "bandwidth_mbps",
+    "seconds",
 )  # fmt: skip
 
 
@@ -68,6 +69,9 @@ class Row(_WithInterval):
         details: The task's further figures by name, each a mean over the scenes that give it.
         groups: The number of every scene's group, shape (S,); None: every scene is its own.
         per_seed: Over several seeds the mean of each, to which `value` and `per_scene` are means.
+        worst_decile: The mean score in the worst tenth of the scenes.
+        lost: The mean score with each of the design's sensors lost, where that was asked for.
+        better: lower or higher, as of the metric.
     """
 
     design: str
@@ -85,6 +89,14 @@ class Row(_WithInterval):
     details: Mapping[str, float] = field(default_factory=dict)
     groups: np.ndarray | None = None
     per_seed: tuple[float, ...] = ()
+    worst_decile: float | None = None
+    lost: tuple[float, ...] = ()
+    better: str = "lower"
+
+    @property
+    def worst_lost(self) -> float | None:
+        """The mean score without the sensor whose loss costs most; None where that was not asked for."""
+        return (max if self.better == "lower" else min)(self.lost, default=None)
 
     @property
     def drawn_interval(self) -> tuple[float, float]:
@@ -98,6 +110,8 @@ class Row(_WithInterval):
             values |= {"matched_to": self.matched_to, "matched_rays": self.matched_rays}
         if self.per_seed:
             values["per_seed"] = list(self.per_seed)
+        if self.lost:
+            values |= {"lost": list(self.lost), "worst_lost": self.worst_lost}
         return values
 
 
@@ -111,6 +125,7 @@ class Paired(_WithInterval):
         difference: Negative where a is lower.
         ci_low, ci_high: Ends of the interval; None where all scenes are of one group.
         rays_b: Rays per frame of b, where they differ: the comparison at equal bandwidth.
+        percent: By how much a's mean is above b's [%], by logarithms; None where a mean is not above 0.
     """
 
     a: str
@@ -120,6 +135,7 @@ class Paired(_WithInterval):
     ci_low: float | None
     ci_high: float | None
     rays_b: int | None = None
+    percent: Interval | None = None
 
     @property
     def drawn_interval(self) -> tuple[float, float]:
@@ -127,9 +143,10 @@ class Paired(_WithInterval):
         return self._drawn(self.difference)
 
     def as_dict(self) -> dict[str, Any]:
-        """The contract's keys and `half_width`, with `rays_b` at equal bandwidth."""
+        """The contract's keys, `half_width` and `percent`, with `rays_b` at equal bandwidth."""
         names = ("a", "b", "rays", "difference", "ci_low", "ci_high", "half_width")
         values = {name: getattr(self, name) for name in names}
+        values["percent"] = self.percent and list(self.percent)
         return values if self.rays_b is None else {**values, "rays_b": self.rays_b}
 
 
@@ -389,7 +406,7 @@ class Audit:
         }
 
 
-def audit_rows(planned: Sequence[Row], everything: Sequence[Row], seed: int) -> list[AuditRow]:
+def audit_rows(planned: Sequence[Row], everything: Sequence[Row], metric: Metric) -> list[AuditRow]:
     """The same rows under both, paired."""
     return [
         AuditRow(
@@ -397,7 +414,7 @@ def audit_rows(planned: Sequence[Row], everything: Sequence[Row], seed: int) -> 
             row.rays,
             row.value,
             other.value,
-            *paired_difference(row.per_scene, other.per_scene, seed, row.groups),
+            *paired_difference(row.per_scene, other.per_scene, row.groups, limits=metric.limits),
             row.seconds,
             other.seconds,
             row.matched_to,
@@ -422,6 +439,8 @@ def csv_text(evaluation: Evaluation) -> str:
         "seconds [s]",
         "matched_to",
         "matched_rays",
+        f"worst decile [{unit}]",
+        f"worst sensor lost [{unit}]",
     )
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
@@ -440,6 +459,8 @@ def csv_text(evaluation: Evaluation) -> str:
                 row.seconds,
                 _no_formula(row.matched_to or ""),
                 "" if row.matched_rays is None else row.matched_rays,
+                row.worst_decile,
+                row.worst_lost,
             )
         )
     return buffer.getvalue()

@@ -28,10 +28,17 @@ from lidardesign.scoring.evaluation.entries import Entry, effect_notes, effect_s
 from lidardesign.scoring.evaluation.mounting import MountError
 from lidardesign.scoring.evaluation.request import EvaluationRequest, left_out
 from lidardesign.scoring.evaluation.results import Audit, Evaluation, Mounting, Paired, Row, audit_rows, middle_rays
-from lidardesign.scoring.scene_scores import RaysPerCondition, score_scenes, silent_notes
-from lidardesign.scoring.statistics import FEWEST_RESAMPLED, mean_interval, paired_difference
+from lidardesign.scoring.scene_scores import RaysPerCondition, score_scenes, silent_notes, without_each
+from lidardesign.scoring.statistics import (
+    FEW_GROUPS,
+    mean_interval,
+    paired_difference,
+    relative_difference,
+    worst_tenth,
+)
 from lidardesign.sensors.compare import outside_notes
 from lidardesign.sensors.sensor import MOST_RAYS
+from lidardesign.simulate.calibration import light_notes
 from lidardesign.simulate.plan import EffectPlan, Planner
 from lidardesign.task import Metric, Score, notes_of
 
@@ -63,11 +70,12 @@ def evaluate(request: EvaluationRequest, progress: Progress | None = None) -> Ev
     """
     request.check()
     entries = entries_of(request)
-    passes = 1 + request.audit + (request.mount_error is not None)
+    passes = 1 + request.audit + bool(request.losing) + (request.mount_error is not None)
     scored = _score_all(request, entries, request.planner, _part(progress, 0, passes))
-    rows = _rows(request, entries, scored)
+    losses = _losses(request, entries, scored.plans, _part(progress, 1, passes)) if request.losing else {}
+    rows = [replace(row, lost=losses.get(n, ())) for n, row in enumerate(_rows(request, entries, scored))]
     effects = effect_summaries(scored.plans)
-    audit = _audit(request, entries, rows, scored.plans, _part(progress, 1, passes)) if request.audit else None
+    audit = _audit(request, entries, rows, scored.plans, _part(progress, passes - 2, passes)) if request.audit else None
     last = _part(progress, passes - 1, passes)
     mounting = request.mount_error and _mounting(request, request.mount_error, entries, rows, scored.plans, last)
     searches = [entry.search for entry in entries if entry.search is not None]
@@ -77,9 +85,9 @@ def evaluate(request: EvaluationRequest, progress: Progress | None = None) -> Ev
         metric=request.metric,
         scenes=len(request.test),
         rows=plain,
-        paired=_pairs(plain, request.seed),
+        paired=_pairs(plain, request.metric),
         equal_bandwidth=matched,
-        paired_bandwidth=_bandwidth_pairs(plain, matched, request.seed),
+        paired_bandwidth=_bandwidth_pairs(plain, matched, request.metric),
         notes=[
             *_notes(request, entries, matched),
             *worst_notes([*plain, *matched], request.metric),
@@ -119,10 +127,29 @@ def _audit(
     return Audit(
         metric.tolerance,
         metric.unit,
-        audit_rows(rows, _rows(request, entries, scored), request.seed),
+        audit_rows(rows, _rows(request, entries, scored), metric),
         skipped=[planned.name for planned, every in paired if every.scenes_on > planned.scenes_on],
         unavailable=[every.name for _, every in paired if every.missing is not None],
     )
+
+
+@phase("losses")
+def _losses(
+    request: EvaluationRequest, entries: Sequence[Entry], plans: Sequence[EffectPlan], progress: Progress | None
+) -> dict[int, tuple[float, ...]]:
+    """The mean score of entries without each of their sensors, by the entry's number, under the same effects."""
+    lost = {
+        (number, sensor): replace(entry, name=f"{entry.name}/{sensor}", positions=left)
+        for number, entry in enumerate(entries)
+        if not entry.baseline and entry.name in request.losing
+        for sensor, left in enumerate(without_each(entry.positions, request.losing[entry.name]))
+    }
+    scored = _score_all(request, list(lost.values()), request.planner, progress, plans)
+    means = [
+        (number, float(np.mean([score.value for score, _ in scored.scores[entry.key]])))
+        for (number, _), entry in lost.items()
+    ]
+    return {own: tuple(mean for number, mean in means if number == own) for own, _ in means}
 
 
 @phase("mounting")
@@ -143,7 +170,7 @@ def _mounting(
     scored = _score_all(request, careless, request.planner, progress, plans)
     exact = [row for row in rows if row.matched_to is None]
     found = [replace(row, design=own.design) for row, own in zip(_rows(request, careless, scored), exact, strict=True)]
-    return Mounting(error, found, [_pair(row, own, request.seed) for row, own in zip(found, exact, strict=True)])
+    return Mounting(error, found, [_pair(row, own, request.metric) for row, own in zip(found, exact, strict=True)])
 
 
 def _misplaced(error: MountError, entry: Entry, seed: int, scene: int) -> RaysPerCondition:
@@ -160,7 +187,7 @@ def _score_all(
 ) -> _Scored:
     """Score all entries in all scenes, here or by workers; `known` plans are not made again."""
     jobs = {entry.key: entry for entry in entries}
-    scene_pass = request.scene_pass(lambda number: [entry.rays_in(number) for entry in jobs.values()], planner, known)
+    scene_pass = request.scene_pass(lambda number: [entry.lit_in(number) for entry in jobs.values()], planner, known)
     scenes = score_scenes(scene_pass, progress, request.starmap)
     of_entries = zip(*(scene.scores for scene in scenes), strict=True)
     return _Scored(
@@ -179,7 +206,7 @@ def _rows(request: EvaluationRequest, entries: Sequence[Entry], scored: _Scored)
 def _row(request: EvaluationRequest, entry: Entry, scores: Sequence[tuple[Score, float]]) -> Row:
     values = np.array([score.value for score, _ in scores])
     groups = group_numbers(request.test)
-    mean, low, high = mean_interval(values, request.seed, groups)
+    mean, low, high = mean_interval(values, groups, limits=request.metric.limits)
     # the mean of each further figure over the scenes that give it; figures that are not finite are left out
     finite: dict[str, list[float]] = {}
     for name, value in (item for score, _ in scores for item in score.details.items()):
@@ -199,19 +226,22 @@ def _row(request: EvaluationRequest, entry: Entry, scores: Sequence[tuple[Score,
         matched_to=entry.matched_to,
         matched_rays=entry.matched_rays,
         groups=groups,
+        worst_decile=worst_tenth(values, request.metric.better),
+        better=request.metric.better,
     )
 
 
-def _pair(first: Row, second: Row, seed: int, rays_b: int | None = None) -> Paired:
-    mean, low, high = paired_difference(first.per_scene, second.per_scene, seed, first.groups)
-    return Paired(first.design, second.design, first.rays, mean, low, high, rays_b)
+def _pair(first: Row, second: Row, metric: Metric, rays_b: int | None = None) -> Paired:
+    values = first.per_scene, second.per_scene, first.groups
+    apart, percent = paired_difference(*values, limits=metric.limits), relative_difference(*values)
+    return Paired(first.design, second.design, first.rays, *apart, rays_b, percent)
 
 
 @phase("intervals")
-def _pairs(rows: Sequence[Row], seed: int) -> list[Paired]:
+def _pairs(rows: Sequence[Row], metric: Metric) -> list[Paired]:
     """Every design against every baseline and every later design, at equal numbers of rays."""
     return [
-        _pair(row, other, seed)
+        _pair(row, other, metric)
         for index, row in enumerate(rows)
         if not row.baseline
         for other in rows[index + 1 :]
@@ -220,9 +250,9 @@ def _pairs(rows: Sequence[Row], seed: int) -> list[Paired]:
 
 
 @phase("intervals")
-def _bandwidth_pairs(rows: Sequence[Row], matched: Sequence[Row], seed: int) -> list[Paired]:
+def _bandwidth_pairs(rows: Sequence[Row], matched: Sequence[Row], metric: Metric) -> list[Paired]:
     designs = {(row.design, row.rays): row for row in rows if not row.baseline}
-    return [_pair(designs[row.matched_to, row.matched_rays], row, seed, row.rays) for row in matched]
+    return [_pair(designs[row.matched_to, row.matched_rays], row, metric, row.rays) for row in matched]
 
 
 def _notes(request: EvaluationRequest, entries: Sequence[Entry], matched: Sequence[Row]) -> list[str]:
@@ -237,7 +267,7 @@ def _notes(request: EvaluationRequest, entries: Sequence[Entry], matched: Sequen
     with plugin_guard(request.task.name):
         notes += notes_of(request.task, request.config, request.space)
     for design in request.designs:
-        notes += outside_notes(design, request.space)
+        notes += outside_notes(design, request.space) + light_notes(design, request.planner.detector)
     own = sorted((entry for entry in entries if not entry.baseline), key=lambda entry: entry.rays)
     shared = [entry for entry in own if entry.rays not in request.alone]
     # of each design the most rays, which come last
@@ -270,12 +300,10 @@ def group_notes(scenes: Sequence[Scene]) -> list[str]:
         return ["only one held-out scene, so there are no intervals"]
     if groups == 1:
         return [f"all {len(scenes)} held-out scenes are of one group, {scenes[0].group!r}: there are no intervals"]
-    if groups == len(scenes):
-        return []
-    of = f"the {len(scenes)} held-out scenes are of {groups} groups"
-    if groups >= FEWEST_RESAMPLED:
-        return [BackgroundNote(f"{of}, and intervals are over groups")]
-    return [f"{of}, too few for narrow intervals: they are Student's t intervals over groups"]
+    of = f"the {len(scenes)} held-out scenes are of {groups} groups" if groups < len(scenes) else ""
+    if groups < FEW_GROUPS:
+        return [f"{of or f'{groups} held-out scenes'}: few groups, so intervals are wide and rough"]
+    return [BackgroundNote(f"{of}, and intervals are over groups")] if of else []
 
 
 def worst_notes(rows: Sequence[Row], metric: Metric) -> list[str]:

@@ -18,20 +18,32 @@ import numpy as np
 from lidardesign.errors import NumericalError
 from lidardesign.scoring.evaluation.entries import mean_baseline
 from lidardesign.scoring.evaluation.results import Evaluation, Mounting, Paired, Row
-from lidardesign.scoring.statistics import LEVEL, Interval, student_interval
+from lidardesign.scoring.statistics import (
+    LEVEL,
+    UNLIMITED,
+    Interval,
+    as_percent,
+    log_ratios,
+    skewness_of_mean,
+    spanned,
+    student_interval,
+)
+from lidardesign.task import Metric
 
 # Design, rays, and what the bandwidth is matched to; rays at equal bandwidth differ between seeds.
 RowKey: TypeAlias = tuple[str, int | None, str | None, int | None]
 
 
-def two_way_interval(table: Any, level: float = LEVEL) -> Interval:
+def two_way_interval(table: Any, *, limits: tuple[float, float] = UNLIMITED, level: float = LEVEL) -> Interval:
     """The mean of a table of seeds by groups with its interval over other seeds and other groups.
 
     The variance is no less than what the errors alone make of it, and its degrees of freedom are no fewer than those of
-    the smaller factor: by chance the mean squares of seeds and groups lie below that of errors, or close to it.
+    the smaller factor: by chance the mean squares of seeds and groups lie below that of errors, or close to it. The
+    mean is skewed as the mean of each factor is, by its part of the variance.
 
     Arguments:
         table: One value per seed and group, shape (R, G).
+        limits: The least and the largest value that there can be.
         level: The share that the interval holds.
 
     Raises:
@@ -52,10 +64,13 @@ def two_way_interval(table: Any, level: float = LEVEL) -> Interval:
     mean_squares = squares / degrees
     variance = mean_squares @ [1.0, 1.0, -1.0]
     if variance <= mean_squares[2]:
-        variance, freedom = mean_squares[2], degrees[2]
+        variance, freedom, skewness = mean_squares[2], degrees[2], 0.0
     else:
+        parts = np.maximum(mean_squares[:2] - mean_squares[2], 0.0) / variance
+        skewness = float(parts**1.5 @ [skewness_of_mean(of_seeds), skewness_of_mean(of_groups)])
         freedom = max(variance**2 / np.sum(np.square(mean_squares) / degrees), degrees[:2].min())
-    return student_interval(mean, math.sqrt(variance / table.size), float(freedom), level)
+    error = math.sqrt(variance / table.size)
+    return student_interval(mean, error, float(freedom), skewness, limits=limits, level=level)
 
 
 def over_seeds(evaluations: Sequence[Evaluation], seeds: Sequence[int], scenes_seed: int) -> Evaluation:
@@ -68,11 +83,11 @@ def over_seeds(evaluations: Sequence[Evaluation], seeds: Sequence[int], scenes_s
         seeds: Their seeds.
         scenes_seed: Of the held-out scenes.
     """
-    first = evaluations[0]
+    first, metric = evaluations[0], evaluations[0].metric
     by_key = [{_key(row): row for row in (*each.rows, *each.equal_bandwidth)} for each in evaluations]
     rows = {key: [rows[key] for rows in by_key] for key in by_key[0] if all(key in rows for rows in by_key)}
-    plain = [_mean_row(found) for key, found in rows.items() if key[2] is None]
-    matched = [_mean_row(found) for key, found in rows.items() if key[2] is not None]
+    plain = [_mean_row(found, metric) for key, found in rows.items() if key[2] is None]
+    matched = [_mean_row(found, metric) for key, found in rows.items() if key[2] is not None]
     pairs = [(pair, (pair.a, pair.rays, None, None), (pair.b, pair.rays, None, None)) for pair in first.paired]
     bandwidth_pairs = [
         (pair, (pair.a, pair.rays, None, None), (pair.b, None, pair.a, pair.rays)) for pair in first.paired_bandwidth
@@ -81,10 +96,10 @@ def over_seeds(evaluations: Sequence[Evaluation], seeds: Sequence[int], scenes_s
     return replace(
         first,
         rows=plain,
-        paired=[_mean_pair(pair, rows[a], rows[b]) for pair, a, b in pairs if a in rows and b in rows],
+        paired=[_mean_pair(pair, rows[a], rows[b], metric) for pair, a, b in pairs if a in rows and b in rows],
         equal_bandwidth=matched,
         paired_bandwidth=[
-            replace(_mean_pair(pair, rows[a], rows[b]), rays_b=_mean_row(rows[b]).rays)
+            replace(_mean_pair(pair, rows[a], rows[b], metric), rays_b=_mean_row(rows[b], metric).rays)
             for pair, a, b in bandwidth_pairs
             if a in rows and b in rows
         ],
@@ -98,7 +113,7 @@ def over_seeds(evaluations: Sequence[Evaluation], seeds: Sequence[int], scenes_s
         searches=[search for each in evaluations for search in each.searches],
         mounting=_mean_mounting(evaluations, rows),
         seeds=tuple(seeds),
-        strongest_baseline=mean_baseline((each.strongest_baseline for each in evaluations), first.metric.better),
+        strongest_baseline=mean_baseline((each.strongest_baseline for each in evaluations), metric.better),
     )
 
 
@@ -107,12 +122,17 @@ def _mean_mounting(evaluations: Sequence[Evaluation], exact: Mapping[RowKey, Seq
     if not mountings:
         return None
     by_key = [{_key(row): row for row in each.rows} for each in mountings]
+    metric = evaluations[0].metric
     careless = {key: [rows[key] for rows in by_key] for key in by_key[0] if key in exact}
     costs = zip(mountings[0].costs, mountings[0].rows, strict=True)
     return Mounting(
         mountings[0].error,
-        [_mean_row(rows) for rows in careless.values()],
-        [_mean_pair(cost, careless[_key(row)], exact[_key(row)]) for cost, row in costs if _key(row) in careless],
+        [_mean_row(rows, metric) for rows in careless.values()],
+        [
+            _mean_pair(cost, careless[_key(row)], exact[_key(row)], metric)
+            for cost, row in costs
+            if _key(row) in careless
+        ],
     )
 
 
@@ -129,9 +149,10 @@ def _table(per_scene: np.ndarray, groups: np.ndarray | None) -> np.ndarray:
     return mean + (sums - mean * counts) / counts.mean()
 
 
-def _mean_row(rows: Sequence[Row]) -> Row:
+def _mean_row(rows: Sequence[Row], metric: Metric) -> Row:
     values = np.stack([row.per_scene for row in rows])
-    mean, low, high = two_way_interval(_table(values, rows[0].groups))
+    mean, low, high = two_way_interval(_table(values, rows[0].groups), limits=metric.limits)
+    deciles, numbers = [row.worst_decile for row in rows], {len(row.lost) for row in rows}
     names = [name for name in rows[0].details if all(name in row.details for row in rows)]
     return replace(
         rows[0],
@@ -145,13 +166,18 @@ def _mean_row(rows: Sequence[Row]) -> Row:
         per_scene=values.mean(axis=0),
         details={name: float(np.mean([row.details[name] for row in rows])) for name in names},
         per_seed=tuple(values.mean(axis=1).tolist()),
+        worst_decile=None if None in deciles else float(np.mean(deciles)),
+        # which sensor is the first says nothing over seeds: from the least score to the largest
+        lost=tuple(np.mean([sorted(row.lost) for row in rows], axis=0).tolist()) if len(numbers) == 1 else (),
     )
 
 
-def _mean_pair(pair: Paired, first: Sequence[Row], second: Sequence[Row]) -> Paired:
-    apart = np.stack([one.per_scene - other.per_scene for one, other in zip(first, second, strict=True)])
-    mean, low, high = two_way_interval(_table(apart, first[0].groups))
-    return replace(pair, difference=mean, ci_low=low, ci_high=high)
+def _mean_pair(pair: Paired, first: Sequence[Row], second: Sequence[Row], metric: Metric) -> Paired:
+    values, groups = [np.stack([row.per_scene for row in rows]) for rows in (first, second)], first[0].groups
+    limits, logs = spanned(metric.limits), log_ratios(*values)
+    mean, low, high = two_way_interval(_table(values[0] - values[1], groups), limits=limits)
+    percent = None if logs is None else as_percent(two_way_interval(_table(logs, groups)))
+    return replace(pair, difference=mean, ci_low=low, ci_high=high, percent=percent)
 
 
 def _joint_notes(evaluations: Sequence[Evaluation], seeds: Sequence[int]) -> list[str]:

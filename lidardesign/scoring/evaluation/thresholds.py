@@ -95,7 +95,7 @@ def check_better(evaluation: Evaluation, name: str) -> None:
 
 def _turned(pair: Paired) -> Paired:
     ends = (None, None) if pair.ci_low is None or pair.ci_high is None else (-pair.ci_high, -pair.ci_low)
-    return replace(pair, a=pair.b, b=pair.a, difference=-pair.difference, ci_low=ends[0], ci_high=ends[1])
+    return replace(pair, a=pair.b, b=pair.a, difference=-pair.difference, ci_low=ends[0], ci_high=ends[1], percent=None)
 
 
 def check_audit(evaluation: Evaluation) -> None:

@@ -43,14 +43,14 @@ FIRST_BIN = 1 << 62
 
 @njit(cache=True, nogil=True)
 def count_alive(counts, offset, pulses, dead, period, key, first_ray):  # noqa: ANN001, ANN201
-    """Counted photons per bin among those that arrive, flat; dead time and time between pulses in bins."""
+    """Counted photons per bin among those that arrive, flat; pulses per ray, dead time and pulse period in bins."""
     found = np.zeros_like(counts)
     for i in range(len(offset) - 1):
         arrived, mine = counts[offset[i] : offset[i + 1]], found[offset[i] : offset[i + 1]]
         if len(arrived) - 1 + dead < period:
-            _within_pulses(arrived, mine, pulses, dead, key, first_ray + i)
+            _within_pulses(arrived, mine, pulses[i], dead, key, first_ray + i)
         else:
-            _across_pulses(arrived, mine, pulses, dead, period, key, first_ray + i)
+            _across_pulses(arrived, mine, pulses[i], dead, period, key, first_ray + i)
     return found
 
 
@@ -263,7 +263,7 @@ def find_corrected(  # noqa: ANN201
     dead,  # noqa: ANN001
     period,  # noqa: ANN001
 ):
-    """Find returns as `find_returns`, corrected for dead time, given pulses, dead time and pulse period in bins."""
+    """Find returns as `find_returns`, corrected for dead time, given pulses of each ray, dead time, period in bins."""
     found = np.full(len(offset) - 1, np.nan)
     longest = 0
     for i in range(len(offset) - 1):
@@ -276,10 +276,10 @@ def find_corrected(  # noqa: ANN201
             continue
         shape = pulse_shape(width, sigma, size)
         reach = len(shape) // 2
-        alive = alive_shares(mine, pulses, dead, period)
+        alive = alive_shares(mine, pulses[i], dead, period)
         photons = np.empty(size)
         for b in range(size):
-            photons[b] = arrived_photons(mine[b], alive[b] * pulses)
+            photons[b] = arrived_photons(mine[b], alive[b] * pulses[i])
         alive[0] *= ends[i, 0]
         alive[-1] *= ends[i, 1]
         counted, room, light = _running(mine), _running(alive), _running(photons)
@@ -293,7 +293,7 @@ def find_corrected(  # noqa: ANN201
             if total - pulse < FEW_BACKGROUND_PHOTONS:
                 level = max(level, known_level[i])
             if matched:
-                ambient = max(arrived_photons(level, pulses), 1.0 / size)
+                ambient = max(arrived_photons(level, pulses[i]), 1.0 / size)
                 signal = max(_around(light, best, reach) - ambient * own, 1.0) / _alive_part(alive, shape, best)
                 best, within = _corrected_matched(photons, alive, shape, signal, ambient, score)
             else:

@@ -78,6 +78,7 @@ CHOICES = {
     "emission": ("scanned", "flood"),
     "histogram_start": ("gate", "pulse"),
     "correction": ("none", "coates"),
+    "emitters": ("sensor", "shared"),
 }
 QUANTITIES = {**TIMING, **LIGHT}
 
@@ -137,6 +138,7 @@ def _detector(document: Document, fallback: str) -> Detector:
         bins=None if found["bins"] is None else round(found["bins"]),
         histogram_start=chosen["histogram_start"] or "gate",
         correction=chosen["correction"] or "none",
+        emitters=chosen["emitters"] or "sensor",
     )
     _check_together(document, detector)
     return detector

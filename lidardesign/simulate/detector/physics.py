@@ -1,8 +1,8 @@
 """Detectors: laser, receiver, timing and histogram bins, and the names of the optional effects.
 
 A detector without photons (`ideal`) reports exact first hits. One with photons has a light budget: emitted energy,
-collected share and timing. Emitted energy is shared among the rays of a frame: a scanned emitter gives each ray its
-share of the pulses, a flood gives each its share of every pulse.
+collected share and timing. Every sensor has an emitter of its own, whose energy its rays share in a frame: a scanned
+emitter gives each ray its share of the pulses, a flood gives each its share of every pulse.
 
 Histograms of photons over time are one per ray, as long as its window, side by side in one flat array.
 """
@@ -20,6 +20,7 @@ import numpy as np
 from lidardesign.errors import ConfigError
 from lidardesign.numerics import SLACK
 from lidardesign.run.validation import suggest
+from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import SPEED_OF_LIGHT_M_S, Scene
 from lidardesign.simulate.detector.light import Echoes
 
@@ -38,8 +39,8 @@ class Photons:
 
     Arguments:
         wavelength_m: Wavelength of the laser [m].
-        pulse_energy_j: Energy of one pulse of the emitter, over all rays that share it [J].
-        pulses_per_frame: Pulses in a frame, over all rays.
+        pulse_energy_j: Energy of one pulse of an emitter, over all rays that share it [J].
+        pulses_per_frame: Pulses of an emitter in a frame, over all rays that share it.
         emission: Whether rays share the pulses in time (`scanned`) or each pulse in energy (`flood`).
         repetition_hz: Pulse repetition rate [Hz].
         aperture_m2: Area of the receiving aperture [m^2].
@@ -67,13 +68,15 @@ class Photons:
         """Energy of a photon, h c / wavelength [J]."""
         return PLANCK_J_S * SPEED_OF_LIGHT_M_S / self.wavelength_m
 
-    def pulses(self, rays: int) -> float:
-        """Pulses per ray and frame, shared by this many rays."""
-        return self.pulses_per_frame / (max(rays, 1) if self.emission == "scanned" else 1)
+    def pulses(self, sharing: np.ndarray) -> np.ndarray:
+        """Pulses per ray and frame where so many rays share an emitter, shape (N,) for (N,)."""
+        return self.pulses_per_frame / np.where(self.emission == "scanned", np.maximum(sharing, 1), 1)
 
-    def emitted(self, rays: int) -> float:
-        """Emitted photons per ray and pulse, shared by this many rays."""
-        return (self.pulse_energy_j / (max(rays, 1) if self.emission == "flood" else 1)) / self.photon_energy_j
+    def emitted(self, sharing: np.ndarray) -> np.ndarray:
+        """Emitted photons per ray and pulse where so many rays share an emitter, shape (N,) for (N,)."""
+        return (
+            self.pulse_energy_j / np.where(self.emission == "flood", np.maximum(sharing, 1), 1) / self.photon_energy_j
+        )
 
 
 @dataclass(frozen=True)
@@ -93,6 +96,7 @@ class Detector:
         bins: Number of bins of a histogram; None: as many as a gate needs.
         histogram_start: Start of its first bin: with the gate, or with the pulse, at range 0.
         correction: Correction for dead time where returns are detected (`coates`).
+        emitters: One for every sensor, or a single one that is shared by all rays of a list.
     """
 
     name: str
@@ -107,6 +111,18 @@ class Detector:
     bins: int | None = None
     histogram_start: Literal["gate", "pulse"] = "gate"
     correction: Literal["none", "coates"] = "none"
+    emitters: Literal["sensor", "shared"] = "sensor"
+
+    def sharing(self, rays: Rays) -> np.ndarray:
+        """Number of rays that share each ray's emitter, shape (N,)."""
+        if self.emitters == "shared":
+            return np.full(len(rays), len(rays))
+        _, place, count = np.unique(rays.sensor, return_inverse=True, return_counts=True)
+        return count[place]
+
+    def light_of(self, rays: Rays) -> np.ndarray | float:
+        """Light of each ray's emitter as a multiple of `photons`, shape (N,) or one for all."""
+        return 1.0 if self.emitters == "shared" or rays.light is None else rays.light
 
     @property
     def timing_sigma_s(self) -> float:

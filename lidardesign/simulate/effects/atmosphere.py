@@ -57,7 +57,7 @@ def through_air(
 
     Arguments:
         scene: Its medium; without one, nothing changes.
-        rays: The rays that share the emitter's energy, N of them.
+        rays: All rays of a list, N of them; those of a sensor share its emitter's energy.
         beams: The thin beams of the rays.
         hits: First hits of the beams.
         windows_m: The rays' gates as half paths, shape (N, 2) [m].
@@ -76,7 +76,8 @@ def through_air(
     np.maximum.at(ends, beams.ray, stops_m)
     edges_m = _cells(windows_m[:, 0], np.clip(ends, windows_m[:, 0], windows_m[:, 1]), photons.aperture_m2)
     gain = _Haze(rays, scene.receiver, medium, photons, ends).gain(edges_m) * _lit_shares(beams, stops_m, edges_m)
-    counts = photons.emitted(len(rays)) * photons.efficiency * gain
+    emitted = photons.emitted(detector.sharing(rays)) * detector.light_of(rays)
+    counts = emitted[:, None] * photons.efficiency * gain
     return faded, replace(background, edges_m=edges_m, counts=counts)
 
 

@@ -139,7 +139,13 @@ class Counts:
     @cached_property
     def pulses(self) -> np.ndarray:
         """Pulses of each ray in a frame, shape (N,)."""
-        return self._by_sharing("pulses")
+        return self.first_hits.detector.photons.pulses(self.first_hits.sharing)
+
+    @cached_property
+    def _emitted(self) -> np.ndarray:
+        """Emitted photons of each ray per pulse, shape (N,)."""
+        detector = self.first_hits.detector
+        return detector.photons.emitted(self.first_hits.sharing) * detector.light_of(self.first_hits.rays)
 
     @cached_property
     def signal_per_pulse(self) -> np.ndarray:
@@ -149,7 +155,7 @@ class Counts:
     @cached_property
     def _of_first_hit(self) -> np.ndarray:
         photons = self.first_hits.detector.photons
-        per_gain = self._by_sharing("emitted") * photons.aperture_m2 * photons.efficiency
+        per_gain = self._emitted * photons.aperture_m2 * photons.efficiency
         # limited before the product: a surface that touches the receiver has the largest gain there is
         return np.minimum(self.first_hits.gain, MOST_COUNTS / (per_gain * self.pulses)) * per_gain
 
@@ -198,7 +204,7 @@ class Counts:
     @cached_property
     def haze_per_pulse(self) -> tuple[np.ndarray, np.ndarray]:
         """Upper bounds of backscattered counts per pulse, in the window up to the return and in one bin, (N,)."""
-        return haze_per_pulse(self.first_hits, self._by_sharing("emitted"), self.bin_m)
+        return haze_per_pulse(self.first_hits, self._emitted, self.bin_m)
 
     @cached_property
     def bin_m(self) -> float:
@@ -306,10 +312,6 @@ class Counts:
     def error_m(self, signal: np.ndarray, sigma_m: np.ndarray) -> np.ndarray:
         """Rms range error with (N,) photons, shape (N,) [m]."""
         return estimate_error_m(self.first_hits.detector, signal, sigma_m)
-
-    def _by_sharing(self, name: str) -> np.ndarray:
-        shared, place = np.unique(self.first_hits.sharing, return_inverse=True)
-        return np.array([getattr(self.first_hits.detector.photons, name)(int(rays)) for rays in shared])[place]
 
 
 def count_text(number: float) -> str:

@@ -67,12 +67,12 @@ class FirstHits:
     @classmethod
     def of(cls, scene: Scene, frame: int, detector: Detector, lists: Sequence[Rays], caster: SceneCaster) -> FirstHits:
         """First hits of lists of rays in a frame."""
-        names = ("origin_m", "direction", "gate_m", "sensor", "time_s")
-        rays = Rays(*(np.concatenate([getattr(one, name) for one in lists]) for name in names))
+        rays = Rays.joined(lists)
         sizes = np.array([len(one) for one in lists])
         row = np.repeat(np.arange(len(lists)), sizes)
+        sharing = np.concatenate([detector.sharing(one) for one in lists])
         hits = caster.first_hit(rays.origin_m, rays.direction)
-        return cls(scene, frame, detector, rays, row, sizes[row], hits, caster)
+        return cls(scene, frame, detector, rays, row, sharing, hits, caster)
 
     def __len__(self) -> int:
         return len(self.rays)

@@ -78,7 +78,7 @@ def interreflections(scene: Scene, frame: int, rays: Rays, physics: Physics) -> 
     Arguments:
         scene: Its bodies' shares of light, and its receiver.
         frame: The time frame.
-        rays: The rays that share the emitter's energy.
+        rays: All rays of a list.
         physics: The detector, and the key of the simulator's random numbers.
 
     Raises:

@@ -32,27 +32,27 @@ from lidardesign.simulate.effects.first_hits import EffectBound, FirstHits
 
 
 def survive_dead_time(
-    counts: np.ndarray, bins: Bins, photons: Photons, rays: int, key: int, first_ray: int
+    counts: np.ndarray, bins: Bins, photons: Photons, pulses: np.ndarray, key: int, first_ray: int
 ) -> np.ndarray:
     """Counted photons per bin among those that arrive, flat with the offsets of `bins`.
 
     Arguments:
         counts: Arriving photons per bin, over all pulses of a frame.
         bins: Bins of N rays.
-        photons: The detector's dead time and pulses.
-        rays: Number of rays that share the pulses.
+        photons: The detector's dead time and time between pulses.
+        pulses: Pulses of each ray, shape (N,).
         key: Key of this effect's random numbers.
         first_ray: Index of the first of the N rays.
     """
     if photons.dead_s == 0:
         return counts
-    pulses = max(round(photons.pulses(rays)), 1)
+    whole = np.maximum(np.round(pulses), 1).astype(np.int64)
     dead_bins = metres(photons.dead_s) / bins.width_m
     period_bins = metres(1 / photons.repetition_hz) / bins.width_m
     # compiled on import, which bounds do not need
     from lidardesign.simulate.detector.dead_time import count_alive
 
-    return count_alive(counts, bins.offset, pulses, dead_bins, period_bins, np.uint64(key), first_ray)
+    return count_alive(counts, bins.offset, whole, dead_bins, period_bins, np.uint64(key), first_ray)
 
 
 def why_absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:
