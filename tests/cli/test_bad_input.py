@@ -127,7 +127,7 @@ CASES = [
     ("fit run --rays 0", 2, "rays"),
     ("fit run --sensors 0", 2, "from 1 to 1000, best"),
     ("fit run --sensors 2.5", 2, "from 1 to 1000, best"),
-    (f"fit run --sensors {'9' * 5000}", 2, "from 1 to 1000, or best"),
+    (f"fit run --sensors {'9' * 5000}", 2, "from 1 to 1000, best"),
     ("fit run --seed 9223372036854775808", 2, "seed"),
     ("fit run --layout spinning --channels 4000000000", 2, "--channels"),
     ("fit run --level 1", 2, "0.01 to 0.999999"),
