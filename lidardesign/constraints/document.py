@@ -269,7 +269,7 @@ class Constraints(SensorConstraints):
     sensors: SensorCount = SensorCount()
     budget: Budget = Budget()
     parts: Parts | None = None
-    survive: Literal[0, 1] = 0
+    survive: int = Field(0, ge=0, le=1)
     each: list[SensorConstraints] = []
 
     @classmethod

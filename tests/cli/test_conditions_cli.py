@@ -52,7 +52,7 @@ def test_a_design_is_fitted_at_a_value(lidardesign, run, layout):
 def test_the_number_of_sensors_at_a_value_is_found_in_scenes_judged_from_there(lidardesign, run):
     result = lidardesign("fit", run, "--at", "x_m=0.37", "--rays", 6, "-v")
     assert result.code == 0, result.err
-    assert "training scenes in" in result.err
+    assert "training scenes by their number" in result.err
     assert dict(load_design(run / "designs" / "fit.yaml").at) == {"x_m": 0.37}
 
 

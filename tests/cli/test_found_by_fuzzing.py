@@ -217,7 +217,7 @@ def test_more_sensors_than_a_mixture_may_have_are_refused_before_anything_is_com
 def test_a_message_does_not_repeat_whole_pages_of_its_input(lidardesign, tmp_path, reader):
     page = "long" * 20_000
     (tmp_path / "c.yaml").write_text(f"{page}: 1\n" if reader == "key" else f"gate: {page}\n")
-    (tmp_path / "run").mkdir()
+    make_run(tmp_path / "run")
     extra = ["--set", f"gate={page}"] if reader == "--set" else ["--constraints", "c.yaml"]
     result = lidardesign("constrain", "run", *extra)
     assert result.code == 2
