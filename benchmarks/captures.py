@@ -72,7 +72,7 @@ def figure_rows(figures: Figures) -> list[list[object]]:
     """Means over heads with 95 % intervals, and the difference to uniform rays head by head."""
     import numpy as np
 
-    from lidardesign.scoring.statistics import mean_interval, paired_difference
+    from lidardesign.estimates import mean_interval, paired_difference
 
     rows = []
     for (estimator, name, gate), values in sorted(figures.items(), key=_place):

@@ -58,7 +58,7 @@ def held(first: Scores, second: Scores, counts: Any, trials: int, generator: Any
     """The shares of intervals of the first mean, of the difference and of the ratio that hold the truth."""
     import numpy as np
 
-    from lidardesign.scoring.statistics import mean_interval, paired_difference, relative_difference
+    from lidardesign.estimates import mean_interval, paired_difference, relative_difference
 
     group = np.repeat(np.arange(len(counts)), counts)
 

@@ -117,7 +117,7 @@ def in_region(scene: Any, points: Any) -> Any:
 
 def percent(values: Any, plain: Any) -> tuple[str, str]:
     """How much lower or higher values are than others of the same heads, and its 95 % interval, in percent."""
-    from lidardesign.scoring.statistics import relative_difference
+    from lidardesign.estimates import relative_difference
 
     found = relative_difference(values, plain)
     return f"{found[0]:+.1f}", f"{found[1]:+.1f} to {found[2]:+.1f}"

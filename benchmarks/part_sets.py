@@ -88,7 +88,8 @@ def compared(options: Any, klux: float) -> dict[str, Any]:
     """The choice against the best other set at an illuminance."""
     from lidardesign.api.run import open_run
     from lidardesign.config import with_task_settings
-    from lidardesign.fitting.request import FitOptions, FitRequest
+    from lidardesign.fitting.options import FitOptions
+    from lidardesign.fitting.request import FitRequest
     from lidardesign.rays.training import TrainingScenes
 
     run, settings = open_run(options.run), [f"illuminance_lux={1000 * klux:g}", "light=sun"]

@@ -115,7 +115,7 @@ def figure_rows(entries: list[Any], tallies: list[Tally]) -> list[list[object]]:
 
 def paired_rows(entries: list[Any], tallies: list[Tally]) -> list[list[object]]:
     """Every design against every baseline at equal rays, scene by scene."""
-    from lidardesign.scoring.statistics import paired_difference
+    from lidardesign.estimates import paired_difference
 
     rows = []
     for entry, tally in zip(entries, tallies, strict=True):

@@ -21,7 +21,8 @@ from lidardesign.api.export import (
 )
 from lidardesign.constraints.document import Constraints
 from lidardesign.errors import ConfigError, DataError, names_arguments
-from lidardesign.fitting.request import FitOptions, FitRequest, FitResult
+from lidardesign.fitting.options import FitOptions
+from lidardesign.fitting.request import FitRequest, FitResult
 from lidardesign.formats.designs import need_run, reach_beside, read_design, relative_folder, run_of
 from lidardesign.rays.information import FEW_SCENES
 from lidardesign.run.clock import WAIT_S, Progress, phase

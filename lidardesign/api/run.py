@@ -12,7 +12,8 @@ from lidardesign.api.design import Design, html_table
 from lidardesign.api.learn import LearnOptions, LearnRequest, check_tolerance
 from lidardesign.constraints.document import Constraints
 from lidardesign.errors import DataError, LidardesignError, names_arguments
-from lidardesign.fitting.request import FitOptions, FitRequest
+from lidardesign.fitting.options import FitOptions
+from lidardesign.fitting.request import FitRequest
 from lidardesign.formats.designs import folder_of, reach_of, read_design
 from lidardesign.run.clock import Progress
 from lidardesign.run.files import writer

@@ -23,6 +23,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import (
@@ -33,10 +34,12 @@ from pydantic import (
 )
 
 from lidardesign.errors import UNSET_HINT, ConfigError
-from lidardesign.run.validation import check_model
-from lidardesign.run.yaml import leaves
+from lidardesign.run.validation import apply_override, check_model, parse_override
+from lidardesign.run.yaml import Document, KeyPath, leaves, load_yaml
+from lidardesign.run_folder import Notes, log_note
 from lidardesign.sensors.sensor import MOST_RAYS
 from lidardesign.space import FARTHEST_M, MOST_TURNS, SHORTEST_M
+from lidardesign.task import Task
 
 Coordinate = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M)]
 Vector = Annotated[list[Coordinate], Field(min_length=3, max_length=3)]
@@ -340,3 +343,42 @@ def _key_paths(values: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
         yield prefix + key
         if isinstance(value, Mapping):
             yield from _key_paths(value, f"{prefix}{key}.")
+
+
+def split_settings(overrides: Sequence[str], task: Task) -> tuple[list[str], list[str]]:
+    """Texts KEY=VALUE that are constraints, and those whose first key is no section of these but a task's own."""
+    firsts = [str(parse_override(text).path[0]) for text in overrides]
+    own = {key for key in firsts if key in task.Config.model_fields and key not in Constraints.model_fields}
+    texts = list(zip(firsts, overrides, strict=True))
+    return [text for key, text in texts if key not in own], [text for key, text in texts if key in own]
+
+
+def load_constraints(
+    given: Constraints | Mapping[str, Any] | Path | str | None, overrides: Sequence[str] = (), notes: Notes = log_note
+) -> Constraints | None:
+    """Constraints of a mapping or a YAML file, with `--set` laid over them; None where nothing is given.
+
+    Raises:
+        ConfigError: At file:line:column, or at the `--set` option; also for unknown parts.
+    """
+    if isinstance(given, Constraints) or (given is None and not overrides):
+        return given
+    if isinstance(given, Mapping):
+        return Constraints.from_mapping(given)
+    document = load_yaml(Path(given)) if given else Document({}, "constraints")
+    values: dict[str, Any] = document.mapping
+    if given and all(value in (None, {}, []) for _, value in leaves(values)):
+        notes(f"{document.where} holds no constraints")
+    origins: dict[KeyPath, str] = {}
+    for text in overrides:
+        override = parse_override(text)
+        origins[apply_override(values, override)] = override.where
+
+    def locate(path: KeyPath, *, key: bool = False) -> str:
+        path = tuple(path)
+        for origin, where in origins.items():
+            if path[: len(origin)] == origin or origin[: len(path)] == path != ():
+                return where
+        return document.locate(path, key=key)
+
+    return Constraints.from_mapping(values, where=document.where, locate=locate)

@@ -121,27 +121,14 @@ def choose_parts(
     bundle = PartBundle(placed, most, training.first(HELD_BACK)[0].frames, detector)
     inform = partial(parts_inform, bundle, informs=informs, count=count, seed=request.seed)
     coverage, chosen, trained = _enough_scenes(bundle, limits, inform, training, progress)
-    numbers = range(request.fewest or count, count + 1)
 
     def trial(members: tuple[int, ...], bound: float) -> SetTrial:
         design = _design(request.name, constraints, [placed[member] for member in members], budget.rays)
         fired = (with_part_light(design.rays(), design, detector),)
         return SetTrial(len(members), fired, members=members, bound=bound, design=design)
 
-    by_number: list[list[SetTrial]] = []
-    for number in numbers:
-        fewer = replace(limits, count=number)
-        with phase("choice"):
-            best = chosen if number == count else choose_set(coverage, fewer)
-            sets = further_sets(coverage, fewer, best.members, MOST_JUDGED)
-        if number > numbers[0] and len(best.members) < number:
-            break
-        by_number.append([trial(best.members, best.bound)])
-        for members in sets[1:]:
-            with suppress(InfeasibleError):  # fewer rays than are asked for
-                by_number[-1].append(trial(members, best.bound))
-    scenes = HeldBackScenes(training, planner)
-    found = _judged(by_number, scenes, request, notes, progress)
+    by_number = _sets_by_number(range(request.fewest or count, count + 1), coverage, limits, chosen, trial)
+    found = _judge_sets(by_number, HeldBackScenes(training, planner), request, notes, progress)
     rows = [_row(one, placed) for one in found] if request.fewest else []
     for row in rows:
         notes(_row_text(row, request.run.metric))
@@ -149,12 +136,7 @@ def choose_parts(
     winner = min(found, key=lambda one: sign * one.scores[: min(len(one.scores) for one in found)].sum())
     if len(winner.members) < count and not request.fewest:
         notes(f"{len(winner.members)} of {count} parts: no further part tells more or fits the bounds")
-    kinds = [placed[member].part for member in winner.members]
-    prices = [part.value("price") for part in kinds]
-    if any(prices):
-        free = ", ".join(dict.fromkeys(part.name for part in kinds if part.value("price") is None))
-        notes(f"the parts cost {sum(filter(None, prices)):.6g} in all{f', without {free}' if free else ''}")
-    for line in reach_notes(winner.design):
+    for line in (*_price_notes([placed[member].part for member in winner.members]), *reach_notes(winner.design)):
         notes(line)
     told = part_table(inform(training.first(HELD_BACK), among=winner.members), len(winner.members))
     certificate = certificate_document(
@@ -169,6 +151,45 @@ def choose_parts(
     )
     design = replace(winner.design, certificates=(certificate,))
     return replace(FitResult.of_choice(design, samples, perf_counter() - started), numbers=tuple(rows))
+
+
+def _sets_by_number(
+    numbers: range,
+    coverage: Coverage,
+    limits: SetLimits,
+    largest: ChosenSet,
+    trial: Callable[[tuple[int, ...], float], SetTrial],
+) -> list[list[SetTrial]]:
+    """The best sets of each number of parts by their information, up to the first that gains nothing by another part.
+
+    Arguments:
+        numbers: The numbers.
+        coverage: The information of all parts.
+        limits: On sets of the largest number.
+        largest: The best set of that number.
+        trial: Makes a trial of the members of a set and the bound of its number.
+    """
+    by_number: list[list[SetTrial]] = []
+    for number in numbers:
+        fewer = replace(limits, count=number)
+        with phase("choice"):
+            best = largest if number == numbers[-1] else choose_set(coverage, fewer)
+            sets = further_sets(coverage, fewer, best.members, MOST_JUDGED)
+        if by_number and len(best.members) < number:
+            break
+        by_number.append([trial(best.members, best.bound)])
+        for members in sets[1:]:
+            with suppress(InfeasibleError):  # fewer rays than are asked for
+                by_number[-1].append(trial(members, best.bound))
+    return by_number
+
+
+def _price_notes(parts: Sequence[Part]) -> list[str]:
+    """A line on what parts cost together, where any price is known."""
+    prices = [part.value("price") for part in parts]
+    unknown = ", ".join(dict.fromkeys(part.name for part in parts if part.value("price") is None))
+    without = f", without {unknown}, whose price is unknown" if unknown else ""
+    return [f"the parts cost {sum(filter(None, prices)):.6g} in all{without}"] if any(prices) else []
 
 
 def _known_parts(constraints: Constraints, notes: Callable[[str], None]) -> list[Part]:
@@ -264,7 +285,7 @@ def _enough_scenes(
         wanted *= 2
 
 
-def _judged(
+def _judge_sets(
     by_number: Sequence[list[SetTrial]],
     scenes: HeldBackScenes,
     request: FitRequest,

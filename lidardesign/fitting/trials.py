@@ -16,6 +16,7 @@ import numpy as np
 
 from lidardesign.constraints.document import Constraints, merged
 from lidardesign.errors import BackgroundNote, InfeasibleError
+from lidardesign.estimates import Interval, mean_interval
 from lidardesign.fitting.request import FitRequest
 from lidardesign.rays.information import FEW_SCENES, MOST_SCENES
 from lidardesign.rays.selection import SHARE_PER_BANDWIDTH
@@ -23,7 +24,6 @@ from lidardesign.rays.training import HELD_BACK, TrainingScenes
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Scene, group_numbers
 from lidardesign.scoring.scene_scores import score_lists, without_each
-from lidardesign.scoring.statistics import Interval, mean_interval
 from lidardesign.sensors.bandwidth import Bandwidth, mean_mbps
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.simulate.plan import Decision, EffectPlan, Planner

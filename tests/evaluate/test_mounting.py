@@ -13,12 +13,12 @@ from support.command_line import make_run
 from support.scoring import design, make_request, rows_by_key, scenes
 
 from lidardesign.errors import ConfigError
+from lidardesign.estimates import paired_difference
 from lidardesign.report.tables import mounting_table
 from lidardesign.scenes.rays import Rays
 from lidardesign.scoring.evaluation.mounting import MountError
 from lidardesign.scoring.evaluation.score import evaluate
 from lidardesign.scoring.evaluation.seeds import over_seeds
-from lidardesign.scoring.statistics import paired_difference
 
 DEGREE = math.pi / 180
 ERROR = MountError(0.005, 0.5 * DEGREE)

@@ -10,6 +10,7 @@ from support.scoring import RAYS, HitTask, MissTask, design, make_request, rows_
 
 from lidardesign.cli.terminal.score_tables import show_evaluation
 from lidardesign.errors import ConfigError, DataError, PluginError
+from lidardesign.estimates import mean_interval, paired_difference
 from lidardesign.report.figures import scores_figure
 from lidardesign.report.tables import paired_tables
 from lidardesign.scoring.baselines import candidates
@@ -17,7 +18,6 @@ from lidardesign.scoring.evaluation.entries import FEWEST_BASELINE_SCENES
 from lidardesign.scoring.evaluation.results import csv_text, verdict
 from lidardesign.scoring.evaluation.score import evaluate
 from lidardesign.scoring.evaluation.thresholds import worse_than_threshold
-from lidardesign.scoring.statistics import mean_interval, paired_difference
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.space import DesignSpace
 from lidardesign.task import Score

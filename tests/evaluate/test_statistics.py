@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import t, ttest_1samp
 
 from lidardesign.errors import NumericalError
-from lidardesign.scoring.statistics import mean_interval, paired_difference, relative_difference
+from lidardesign.estimates import mean_interval, paired_difference, relative_difference
 
 TRIALS = 1000
 # Of scores of two designs with mean 1: what one group adds, and a usual scene.

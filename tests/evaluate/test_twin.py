@@ -15,7 +15,8 @@ from lidardesign.density.objective.proposals import samples_without_visibility
 from lidardesign.errors import InfeasibleError
 from lidardesign.fitting import fit as fit_module
 from lidardesign.fitting.fit import fit_design, twin_without_visibility
-from lidardesign.fitting.request import FitOptions, FitRequest, RunTarget
+from lidardesign.fitting.options import FitOptions
+from lidardesign.fitting.request import FitRequest, RunTarget
 from lidardesign.run_folder import RunFolder
 from lidardesign.scoring.baselines.greedy import Fired
 from lidardesign.scoring.baselines.simple import TwinCandidate

@@ -15,7 +15,8 @@ from lidardesign.api.run import open_run
 from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.fitting import request as requests
 from lidardesign.fitting import trials as tried
-from lidardesign.fitting.request import BEST, CHOSEN_LEVEL, FitOptions, FitRequest
+from lidardesign.fitting.options import BEST, FitOptions
+from lidardesign.fitting.request import CHOSEN_LEVEL, FitRequest
 from lidardesign.run_folder import RunFolder
 from lidardesign.scenes.scene import group_numbers
 from lidardesign.sensors.design import DesignSpec

@@ -13,7 +13,8 @@ from support.sensors import normal_sensor
 
 from lidardesign.api.run import open_run
 from lidardesign.errors import ConfigError, InfeasibleError
-from lidardesign.fitting.request import FitOptions, FitRequest
+from lidardesign.fitting.options import FitOptions
+from lidardesign.fitting.request import FitRequest
 from lidardesign.fitting.trials import FINENESS, GoalSearch, rounded_up
 from lidardesign.run_folder import RunFolder
 from lidardesign.sensors.bandwidth import Bandwidth

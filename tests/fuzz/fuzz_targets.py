@@ -42,8 +42,8 @@ def read_configuration(path: Path) -> object:
 def open_overrides(_: Path) -> Read:
     """As `--set` does, for a configuration and for constraints."""
     from lidardesign.config import resolve
+    from lidardesign.constraints.document import load_constraints
     from lidardesign.errors import LidardesignError
-    from lidardesign.fitting.request import load_constraints
     from lidardesign.registry import load_task
 
     def configured(text: str) -> object:
@@ -74,9 +74,9 @@ def _spaces() -> list[object]:
 
 def read_constraints(path: Path) -> object:
     """As `constrain --constraints` does, up to the check that any design can satisfy them."""
+    from lidardesign.constraints.document import load_constraints
     from lidardesign.constraints.feasibility import check_feasible
     from lidardesign.errors import InfeasibleError
-    from lidardesign.fitting.request import load_constraints
     from lidardesign.run.yaml import dump_yaml, parse_yaml
 
     constraints = load_constraints(path)

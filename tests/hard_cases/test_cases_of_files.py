@@ -15,10 +15,10 @@ from support.hard_cases import hard_case
 from support.tables import each_row
 
 from lidardesign.config import resolve
+from lidardesign.constraints.document import load_constraints
 from lidardesign.density.training.checkpoint import FORMAT, load_arrays, save_arrays
 from lidardesign.density.training.trainer import CHECKPOINT
 from lidardesign.errors import ConfigError, DataError, LidardesignError
-from lidardesign.fitting.request import load_constraints
 from lidardesign.formats.designs import load_design
 from lidardesign.registry import load_task
 from lidardesign.run.manifest import record, start_manifest

@@ -34,6 +34,7 @@ from lidardesign.density.objective.target import build_target
 from lidardesign.density.training.checkpoint import load_arrays, save_arrays
 from lidardesign.density.training.quality import coverage, quality
 from lidardesign.errors import LidardesignError
+from lidardesign.estimates import mean_interval
 from lidardesign.fitting import fit as fit_design
 from lidardesign.mixture.em import lloyd
 from lidardesign.run.manifest import record, start_manifest
@@ -42,7 +43,6 @@ from lidardesign.samples import Samples
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Ambient, Body, Box, Capsule, Medium, Mesh, Scene, Sphere, rigid
 from lidardesign.scoring.scene_scores import checked_score
-from lidardesign.scoring.statistics import mean_interval
 from lidardesign.sensors.bandwidth import split_budget
 from lidardesign.simulate.returns import simulate
 from lidardesign.space import DesignSpace

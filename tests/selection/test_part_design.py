@@ -14,11 +14,11 @@ from support.command_line import make_run
 
 from lidardesign.api.run import open_run
 from lidardesign.constraints.check import check_design
+from lidardesign.constraints.document import split_settings
 from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.fitting import part_design
 from lidardesign.fitting.part_sets import SetLimits, choose_set
 from lidardesign.fitting.part_shapes import COARSE_CELL_RAD, PartBundle, cells_of, part_table, parts_inform
-from lidardesign.fitting.request import split_settings
 from lidardesign.parts.catalogue import FOLDER, find_part, load_library, part_rays
 from lidardesign.rays import information
 from lidardesign.samples import load_samples

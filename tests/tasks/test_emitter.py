@@ -18,7 +18,8 @@ from lidardesign.constraints.document import Constraints
 from lidardesign.density.objective.proposals import propose
 from lidardesign.density.objective.target import build_target
 from lidardesign.fitting.fit import fit_design
-from lidardesign.fitting.request import FitOptions, FitRequest
+from lidardesign.fitting.options import FitOptions
+from lidardesign.fitting.request import FitRequest
 from lidardesign.run.manifest import start_manifest
 from lidardesign.run.yaml import parse_yaml
 from lidardesign.run_folder import RunFolder

@@ -49,7 +49,8 @@ def fit(
     """Fit sensors to the density of RUN."""
     with command(json=json, quiet=quiet, verbose=verbose) as output:
         with phase("libraries"):
-            from lidardesign.fitting.request import FitOptions, FitRequest
+            from lidardesign.fitting.options import FitOptions
+            from lidardesign.fitting.request import FitRequest
             from lidardesign.run_folder import RunFolder
 
         chosen = FitOptions(
@@ -147,8 +148,9 @@ def constrain(
     """Fit sensors again under constraints; nothing is learned again."""
     with command(json=json, quiet=quiet, verbose=verbose) as output:
         with phase("libraries"):
-            from lidardesign.constraints.document import Constraints
-            from lidardesign.fitting.request import FitOptions, FitRequest, load_constraints, split_settings
+            from lidardesign.constraints.document import Constraints, load_constraints, split_settings
+            from lidardesign.fitting.options import FitOptions
+            from lidardesign.fitting.request import FitRequest
             from lidardesign.formats.designs import need_run, open_target
 
         opened, design = open_target(target, output.remark)

@@ -14,6 +14,7 @@ from functools import cached_property, partial
 import numpy as np
 
 from lidardesign.errors import ConfigError
+from lidardesign.estimates import mean_interval
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import Progress, phase
 from lidardesign.scenes.casting import SceneCaster
@@ -24,7 +25,6 @@ from lidardesign.scoring.accuracy.probes import AccuracyRequest
 from lidardesign.scoring.evaluation.request import EvaluationRequest, numbers_fired
 from lidardesign.scoring.evaluation.results import Row
 from lidardesign.scoring.scene_scores import RaysPerCondition, score_lists
-from lidardesign.scoring.statistics import mean_interval
 from lidardesign.scoring.sweep import Accuracy, Measurement, Sweep, timed, with_memory
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.simulate.detector.files import load_detector

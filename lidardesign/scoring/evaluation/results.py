@@ -17,11 +17,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lidardesign.estimates import HALF_INTERVAL, Estimate, as_documents
+from lidardesign.estimates import HALF_INTERVAL, Estimate, Interval, as_documents, paired_difference
 from lidardesign.run.files import write_atomic
 from lidardesign.scoring.evaluation.entries import EffectSummary
 from lidardesign.scoring.evaluation.mounting import MountError
-from lidardesign.scoring.statistics import Interval, paired_difference
 from lidardesign.scoring.sweep import Accuracy
 from lidardesign.task import Metric
 

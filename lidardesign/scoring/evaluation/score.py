@@ -17,6 +17,13 @@ from typing import Any
 import numpy as np
 
 from lidardesign.errors import BackgroundNote
+from lidardesign.estimates import (
+    FEW_GROUPS,
+    mean_interval,
+    paired_difference,
+    relative_difference,
+    worst_tenth,
+)
 from lidardesign.numerics import ROUNDING
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import Progress, phase
@@ -29,13 +36,6 @@ from lidardesign.scoring.evaluation.mounting import MountError
 from lidardesign.scoring.evaluation.request import EvaluationRequest, left_out
 from lidardesign.scoring.evaluation.results import Audit, Evaluation, Mounting, Paired, Row, audit_rows, middle_rays
 from lidardesign.scoring.scene_scores import RaysPerCondition, score_scenes, silent_notes, without_each
-from lidardesign.scoring.statistics import (
-    FEW_GROUPS,
-    mean_interval,
-    paired_difference,
-    relative_difference,
-    worst_tenth,
-)
 from lidardesign.sensors.compare import outside_notes
 from lidardesign.sensors.sensor import MOST_RAYS
 from lidardesign.simulate.calibration import light_notes

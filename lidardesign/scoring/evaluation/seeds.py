@@ -16,9 +16,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from lidardesign.errors import NumericalError
-from lidardesign.scoring.evaluation.entries import mean_baseline
-from lidardesign.scoring.evaluation.results import Evaluation, Mounting, Paired, Row
-from lidardesign.scoring.statistics import (
+from lidardesign.estimates import (
     LEVEL,
     UNLIMITED,
     Interval,
@@ -28,6 +26,8 @@ from lidardesign.scoring.statistics import (
     spanned,
     student_interval,
 )
+from lidardesign.scoring.evaluation.entries import mean_baseline
+from lidardesign.scoring.evaluation.results import Evaluation, Mounting, Paired, Row
 from lidardesign.task import Metric
 
 # Design, rays, and what the bandwidth is matched to; rays at equal bandwidth differ between seeds.
