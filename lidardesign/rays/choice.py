@@ -6,8 +6,7 @@ Then one ray at a time leaves and the best of the others comes in, until no swap
 guaranteed: `certificate` bounds the loss.
 
 Where all that can be known of the training scenes is known, further rays are chosen in another layer, as if none fired
-yet: of other scenes they see what the first ones just miss. A ceiling of 1000 rays over an arm is 11 to 27 % better by
-it, on held-out scenes and at equal bandwidth.
+yet: of other scenes they see what the first ones just miss.
 """
 
 from __future__ import annotations
