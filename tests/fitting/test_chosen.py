@@ -125,7 +125,7 @@ class TestTheCommand:
         assert "tells anything about 5 training scenes" in refused.err
 
     def test_needs_a_task_that_says_what_returns_tell(self, lidardesign, run, monkeypatch):
-        monkeypatch.setattr("lidardesign.fitting.request.informs_rays", lambda task: False)
+        monkeypatch.setattr("lidardesign.fitting.options.informs_rays", lambda task: False)
         refused = lidardesign("fit", run, "--layout", "chosen")
         assert refused.code == 2
         assert "has no method informs" in refused.err
