@@ -296,16 +296,17 @@ def _judge_sets(
     trials, metric = [one for sets in by_number for one in sets], request.run.metric
     if len(trials) == 1 and scenes.planner is None and not request.fewest:
         return trials
+    first = max(information.FEW_SCENES // 2, 1)
     # together first: the effects are those that any of the sets calls for
-    for number in range(1, len(scenes.training.first(HELD_BACK)) + 1):
+    for number in range(1, first + 1):
         began = perf_counter()
         scenes.score(trials, number)
-        left = (perf_counter() - began) * (len(scenes.training.first(HELD_BACK)) - number)
+        left = (perf_counter() - began) * (first - number)
         progress(f"judging {len(trials)} sets of parts, about {left:.0f} s left")
-    found = [best_of(sets, scenes, metric, price=None) for sets in by_number]
+    found = [best_of(sets, scenes, metric, None, first) for sets in by_number]
     for one, sets in zip(found, by_number, strict=True):
         text = f"{metric.name} [{metric.unit}] of {len(sets)} sets of {one.sensors} parts on training scenes"
-        values = ", ".join(f"{each.scores[: information.FEW_SCENES].mean():.4g}" for each in sets)
+        values = ", ".join(f"{each.scores[:first].mean():.4g}" for each in sets)
         notes(BackgroundNote(f"{text}, the best by the proxy first: {values}"))
     for line in scenes.effects:
         notes(line)

@@ -175,7 +175,11 @@ def trial_of(request: FitRequest, design: DesignSpec, rays: int | None) -> Trial
 
 
 def best_of(
-    trials: Sequence[Trial], scenes: HeldBackScenes, metric: Metric, price: float | None = SHARE_PER_BANDWIDTH
+    trials: Sequence[Trial],
+    scenes: HeldBackScenes,
+    metric: Metric,
+    price: float | None = SHARE_PER_BANDWIDTH,
+    first: int | None = None,
 ) -> Trial:
     """The first trial that is no worse than the best by more than the standard error of the difference.
 
@@ -188,8 +192,9 @@ def best_of(
         price: The price of bandwidth, as in a choice of rays: ten percent more of it must bring two percent of the best
             score, or of its distance from the worst value, whichever is less. None: bandwidth is free, and the best by
             the mean is taken.
+        first: On how many scenes all trials are scored; else on `FEW_SCENES`.
     """
-    scenes.score(trials, FEW_SCENES)
+    scenes.score(trials, first or FEW_SCENES)
     while True:
         count = len(trials[0].scores)
         lost, errors, scale = _losses(trials, scenes.groups[:count], metric, price or 0.0)
