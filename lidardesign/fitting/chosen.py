@@ -23,7 +23,13 @@ from lidardesign.numerics import COARSE_SLACK
 from lidardesign.rays.gates import GateLimits
 from lidardesign.rays.information import FEW_SCENES, MOST_SELECTED
 from lidardesign.rays.pool import CandidatePool, cached_information
-from lidardesign.rays.proposals import CANDIDATES_PER_RAY, Proposals, first_candidates, rays_of_points
+from lidardesign.rays.proposals import (
+    CANDIDATES_PER_RAY,
+    LEAST_CANDIDATES_OF_REGIONS,
+    Proposals,
+    first_candidates,
+    rays_of_points,
+)
 from lidardesign.rays.selection import Selected, Selection, inform_enough, select
 from lidardesign.rays.training import CHOICE, InformedScene, TrainingScenes
 from lidardesign.run.clock import phase
@@ -113,7 +119,9 @@ def choose_rays(
     if may_fail:
         placed = widened(placed, constraints.rules, level, samples)
     proposals = Proposals(placed, constraints.rules, level, samples, by_turns=may_fail)
-    wanted, weights = CANDIDATES_PER_RAY * counts[-1], np.array([sensor.weight for sensor in placed])
+    in_regions = any(sensor.origin_covariance_m2 is not None for sensor in placed)
+    wanted = max(CANDIDATES_PER_RAY * counts[-1], LEAST_CANDIDATES_OF_REGIONS if in_regions else 0)
+    weights = np.array([sensor.weight for sensor in placed])
     least = np.full(len(weights), CANDIDATES_PER_RAY if each_fires else 0)
     if len(conditions) > 1:
         # so that patterns along a condition fire as many rays of each sensor everywhere

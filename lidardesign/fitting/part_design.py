@@ -51,7 +51,7 @@ from lidardesign.simulate.detector.physics import IDEAL, Detector, check_windows
 from lidardesign.space import angles, observed_point
 from lidardesign.task import Information, Metric, random_generator
 
-MOST_JUDGED = 8  # sets of a number of parts, by the task's score
+MOST_JUDGED = 8  # sets of a number of parts, by the task's score; twice as many under a detector
 MOST_POSES = 500  # of each kind of part, over all places
 MOST_PLACES = 25  # in a box of origins
 MOST_TOLD = 1_000_000  # candidates times scenes
@@ -120,14 +120,17 @@ def choose_parts(
         )
     bundle = PartBundle(placed, most, training.first(HELD_BACK)[0].frames, detector)
     inform = partial(parts_inform, bundle, informs=informs, count=count, seed=request.seed)
-    coverage, chosen, trained = _enough_scenes(bundle, limits, inform, training, progress)
+    # under a detector information ranks sets little: it proposes more of them, on fewer scenes, and the score decides
+    most_scenes = information.MOST_SCENES if planner is None else 2 * information.FEW_SCENES
+    coverage, chosen, trained = _enough_scenes(bundle, limits, inform, training, most_scenes, progress)
 
     def trial(members: tuple[int, ...], bound: float) -> SetTrial:
         design = _design(request.name, constraints, [placed[member] for member in members], budget.rays)
         fired = (with_part_light(design.rays(), design, detector),)
         return SetTrial(len(members), fired, members=members, bound=bound, design=design)
 
-    by_number = _sets_by_number(range(request.fewest or count, count + 1), coverage, limits, chosen, trial)
+    numbers, judged = range(request.fewest or count, count + 1), MOST_JUDGED * (1 if planner is None else 2)
+    by_number = _sets_by_number(numbers, coverage, limits, chosen, judged, trial)
     found = _judge_sets(by_number, HeldBackScenes(training, planner), request, notes, progress)
     rows = [_row(one, placed) for one in found] if request.fewest else []
     for row in rows:
@@ -158,6 +161,7 @@ def _sets_by_number(
     coverage: Coverage,
     limits: SetLimits,
     largest: ChosenSet,
+    most: int,
     trial: Callable[[tuple[int, ...], float], SetTrial],
 ) -> list[list[SetTrial]]:
     """The best sets of each number of parts by their information, up to the first that gains nothing by another part.
@@ -167,6 +171,7 @@ def _sets_by_number(
         coverage: The information of all parts.
         limits: On sets of the largest number.
         largest: The best set of that number.
+        most: The largest number of sets.
         trial: Makes a trial of the members of a set and the bound of its number.
     """
     by_number: list[list[SetTrial]] = []
@@ -174,7 +179,7 @@ def _sets_by_number(
         fewer = replace(limits, count=number)
         with phase("choice"):
             best = largest if number == numbers[-1] else choose_set(coverage, fewer)
-            sets = further_sets(coverage, fewer, best.members, MOST_JUDGED)
+            sets = further_sets(coverage, fewer, best.members, most)
         if by_number and len(best.members) < number:
             break
         by_number.append([trial(best.members, best.bound)])
@@ -254,9 +259,10 @@ def _enough_scenes(
     limits: SetLimits,
     inform: Callable[..., list[InformedScene]],
     training: TrainingScenes,
+    most: int,
     progress: Callable[[str], None],
 ) -> tuple[Coverage, ChosenSet, list[InformedScene]]:
-    """The information of all parts about enough scenes, the best set by it, and the scenes.
+    """The information of all parts about enough scenes, at most so many, the best set by it, and the scenes.
 
     Raises:
         DataError: No part has information about the scenes.
@@ -279,7 +285,7 @@ def _enough_scenes(
             )
         judged = part_table(inform(held_back, among=chosen.members), len(chosen.members))
         before, loss = loss, judged.loss_of(np.zeros(len(chosen.members), dtype=np.intp))
-        is_large = 2 * wanted > information.MOST_SCENES or 2 * wanted * len(bundle.placed) > MOST_TOLD
+        is_large = 2 * wanted > most or 2 * wanted * len(bundle.placed) > MOST_TOLD
         if is_large or are_enough(before, loss, coverage.complete - chosen.value):
             return coverage, chosen, informed
         wanted *= 2
@@ -296,17 +302,17 @@ def _judge_sets(
     trials, metric = [one for sets in by_number for one in sets], request.run.metric
     if len(trials) == 1 and scenes.planner is None and not request.fewest:
         return trials
-    first = max(information.FEW_SCENES // 2, 1)
+    few = max(information.FEW_SCENES // 4, 1)
     # together first: the effects are those that any of the sets calls for
-    for number in range(1, first + 1):
+    for number in range(1, few + 1):
         began = perf_counter()
         scenes.score(trials, number)
-        left = (perf_counter() - began) * (first - number)
+        left = (perf_counter() - began) * (few - number)
         progress(f"judging {len(trials)} sets of parts, about {left:.0f} s left")
-    found = [best_of(sets, scenes, metric, None, first) for sets in by_number]
+    found = [best_of(sets, scenes, metric, None, few, 2 * information.FEW_SCENES) for sets in by_number]
     for one, sets in zip(found, by_number, strict=True):
         text = f"{metric.name} [{metric.unit}] of {len(sets)} sets of {one.sensors} parts on training scenes"
-        values = ", ".join(f"{each.scores[:first].mean():.4g}" for each in sets)
+        values = ", ".join(f"{each.scores[:few].mean():.4g}" for each in sets)
         notes(BackgroundNote(f"{text}, the best by the proxy first: {values}"))
     for line in scenes.effects:
         notes(line)

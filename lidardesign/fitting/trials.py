@@ -179,7 +179,8 @@ def best_of(
     scenes: HeldBackScenes,
     metric: Metric,
     price: float | None = SHARE_PER_BANDWIDTH,
-    first: int | None = None,
+    few: int | None = None,
+    most: int | None = None,
 ) -> Trial:
     """The first trial that is no worse than the best by more than the standard error of the difference.
 
@@ -192,15 +193,15 @@ def best_of(
         price: The price of bandwidth, as in a choice of rays: ten percent more of it must bring two percent of the best
             score, or of its distance from the worst value, whichever is less. None: bandwidth is free, and the best by
             the mean is taken.
-        first: On how many scenes all trials are scored; else on `FEW_SCENES`.
+        few, most: On how many scenes all trials are scored, and the last ones at most; else as in a choice of rays.
     """
-    scenes.score(trials, first or FEW_SCENES)
+    scenes.score(trials, few or FEW_SCENES)
     while True:
         count = len(trials[0].scores)
         lost, errors, scale = _losses(trials, scenes.groups[:count], metric, price or 0.0)
         open_trials = [trial for trial, mean, error in zip(trials, lost, errors, strict=True) if mean <= 2 * error]
         is_clear = errors[lost <= 2 * errors].max() <= CLEAR_SHARE * scale
-        if len(open_trials) == 1 or is_clear or 2 * count > MOST_SCENES:
+        if len(open_trials) == 1 or is_clear or 2 * count > (most or MOST_SCENES):
             allowed = 0 * errors if price is None else errors
             return next(trial for trial, mean, error in zip(trials, lost, allowed, strict=True) if mean <= error)
         trials = open_trials

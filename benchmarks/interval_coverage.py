@@ -4,7 +4,7 @@ A usual score is the difficulty of a group, which both designs share, times what
 in a scene; where a design fails, its score is the worst value, ten times a usual one. Intervals are those of
 `evaluate`: of a design's mean, of the paired difference, and of the ratio.
 
-    python benchmarks/coverage.py
+    python benchmarks/interval_coverage.py
 """
 
 from __future__ import annotations
