@@ -210,6 +210,10 @@ class Task(Protocol):
     A task may also give `informs(scene, returns) -> Information`, the information of returns for choosing rays;
     `returns` are as in `score`, of all candidate rays through open gates. Rays of a task without it are not chosen.
 
+    A task may also give `features(scene, returns) -> array`, a few numbers of one frame's returns, always as many, by
+    which the pattern of the next frame is picked, as the place of what is tracked; not a number where nothing is known.
+    Without it, ranges of a first look inside the frame pick the pattern.
+
     A task may also give `metric_of(config) -> Metric`, where the worst value or the tolerance depend on its
     configuration; `metric` then has the usual ones. Name, unit and direction are those of `metric`, or of one of
     `metrics`, further ones that a key of the configuration selects.

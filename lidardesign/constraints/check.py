@@ -72,7 +72,7 @@ def check_design(document: Mapping[str, Any], constraints: Any, space: Any = Non
     rules = constraints.as_document() if hasattr(constraints, "as_document") else dict(constraints or {})
     bounds = space.as_dict() if hasattr(space, "as_dict") else space
     z = NormalDist().inv_cdf((1 + float(document.get("level", 0.95))) / 2)
-    patterns = document.get("patterns") or []
+    patterns = [*(document.get("patterns") or []), *(_get(document, "adaptive", "patterns") or [])]
     sensors, each = list(document["sensors"]), list(rules.get("each") or [])
     own_rules = [_over(rules, each[index]) if index < len(each) else rules for index in range(len(sensors))]
     checks = _between("sensors", len(sensors), rules.get("sensors"))
@@ -313,7 +313,8 @@ def _astray(pattern: Mapping[str, Any], sensors: Sequence[Mapping[str, Any]]) ->
 def _budget(document: Mapping[str, Any], budget: Mapping[str, Any]) -> list[ConstraintCheck]:
     """Checks of the number of rays and their bandwidth: rays times whole bins times bits times frames [Mbit/s]."""
     bin_m = LIGHT_M_PER_S * budget.get("bin_ps", 100.0) * PICOSECOND_S / 2
-    widths = [_pattern_widths(pattern, bin_m) for pattern in document.get("patterns") or ()]
+    patterns = [*(document.get("patterns") or ()), *(_get(document, "adaptive", "patterns") or ())]
+    widths = [_pattern_widths(pattern, bin_m) for pattern in patterns]
     asked, limit, checks = budget.get("rays"), budget.get("bandwidth_mbps"), []
     own = _get(document, "constraints", "budget", "rays")
     rays = asked if own is None else own
@@ -321,7 +322,7 @@ def _budget(document: Mapping[str, Any], budget: Mapping[str, Any]) -> list[Cons
         widths = [_even_widths(document["sensors"], rays)]
     if asked is not None:
         counts = [len(each) for each in widths]
-        checks.append(ConstraintCheck("budget.rays", asked, counts[-1], counts == [asked]))
+        checks.append(ConstraintCheck("budget.rays", asked, counts[-1], set(counts) == {asked}))
     if limit is not None:
         mbps = None
         if widths:

@@ -21,7 +21,7 @@ from lidardesign.mixture.bounds import INWARD, bounds_of
 from lidardesign.mixture.fit import FittedSensors
 from lidardesign.numerics import COARSE_SLACK
 from lidardesign.rays.gates import GateLimits
-from lidardesign.rays.information import FEW_SCENES, MOST_SELECTED
+from lidardesign.rays.information import FEW_SCENES, MOST_SELECTED, features_of
 from lidardesign.rays.pool import CandidatePool, cached_information
 from lidardesign.rays.proposals import (
     CANDIDATES_PER_RAY,
@@ -31,10 +31,11 @@ from lidardesign.rays.proposals import (
     rays_of_points,
 )
 from lidardesign.rays.selection import Selected, Selection, inform_enough, select
-from lidardesign.rays.training import CHOICE, InformedScene, TrainingScenes
+from lidardesign.rays.training import CHOICE, HELD_BACK, InformedScene, TrainingScenes
 from lidardesign.run.clock import phase
 from lidardesign.samples import Samples
 from lidardesign.scenes.rays import Rays
+from lidardesign.sensors.adaptive import AdaptivePatterns
 from lidardesign.sensors.bandwidth import Bandwidth, split_budget
 from lidardesign.sensors.pattern import Pattern
 from lidardesign.sensors.sensor import Sensor, interval_factor, tangent_directions
@@ -67,6 +68,7 @@ class ChosenRays(NamedTuple):
         idle: Indices of sensors that fire no ray at the largest number.
         silent: The share of scenes held back about which the largest number of rays has no information.
         shared: The share of what sensors see that several of them see; 1 where none may fail.
+        adaptive: Patterns that follow what they see; None where they are not asked for, or bring nothing.
     """
 
     sensors: tuple[Sensor, ...]
@@ -75,6 +77,7 @@ class ChosenRays(NamedTuple):
     idle: tuple[int, ...]
     silent: float
     shared: float = 1.0
+    adaptive: AdaptivePatterns | None = None
 
 
 def choose_rays(
@@ -90,6 +93,7 @@ def choose_rays(
     certified: Sequence[int] = (),
     each_fires: bool = False,
     is_trial: bool = False,
+    most_patterns: int = 0,
     progress: Callable[[str], None] = lambda step: None,
 ) -> ChosenRays:
     """The rays of fitted sensors, one choice for each number of rays.
@@ -106,6 +110,7 @@ def choose_rays(
         certified: The numbers of rays for which a bound is found.
         each_fires: Whether every sensor has to fire a ray.
         is_trial: Whether the first few scenes are enough where candidates are cast anew.
+        most_patterns: The largest number of patterns that follow what they see; 0: none do.
         progress: Called with every step.
 
     Raises:
@@ -151,10 +156,12 @@ def choose_rays(
         inform = cached_information if pool is None and training.keeps else inform_enough
         informed, held_back = inform(selection, training, counts[len(counts) // 2], progress)
     selected = select(selection, informed, held_back, counts, certified, progress)
+    adaptive = _adaptive(selection, selected[-1], training, most_patterns, progress) if most_patterns else None
     patterns = tuple(_pattern(one, conditions, samples) for one in selected)
+    every = (*patterns, *(() if adaptive is None else adaptive.patterns))
     per_sensor = patterns[-1].per_sensor(len(placed))
     sensors = tuple(
-        _around_rays(sensor, index, patterns, rules_of(constraints.rules, index), samples)
+        _around_rays(sensor, index, every, rules_of(constraints.rules, index), samples)
         for index, sensor in enumerate(placed)
     )
     shares = per_sensor / per_sensor.sum()
@@ -165,7 +172,37 @@ def choose_rays(
         tuple(np.flatnonzero(per_sensor == 0).tolist()),
         selected[-1].silent,
         proposals.share_of_several(conditions[len(conditions) // 2]) if may_fail else 1.0,
+        adaptive,
     )
+
+
+def _adaptive(
+    selection: Selection,
+    selected: Selected,
+    training: TrainingScenes,
+    most: int,
+    progress: Callable[[str], None],
+) -> AdaptivePatterns | None:
+    """Patterns that follow what they see, of the candidates and gates of a choice."""
+    from lidardesign.rays.adaptive import PatternSearch, training_frames
+
+    rays, features = selection.rays, features_of(training.run.task)
+    if features is not None and training.first(HELD_BACK)[0].frames == 1:
+        features = None
+    frames, held_back = (
+        training_frames(training, purpose, rays, selection.share, features) for purpose in (CHOICE, HELD_BACK)
+    )
+    search = PatternSearch(selection, selected.gates_m, selected.choice, frames, held_back, training.seed)
+    found = search.best(most, progress)
+    if found is None:
+        return None
+    patterns = []
+    for gate in found.gates:
+        rest = np.setdiff1d(np.flatnonzero(gate >= 0), found.look)
+        order = np.concatenate([found.look, rest[np.argsort(rays.sensor[rest], kind="stable")]])
+        fired = replace(rays.subset(order), gate_m=search.gate_m(gate)[order])
+        patterns.append(Pattern.of(fired.as_angles()))
+    return AdaptivePatterns(found.rule, tuple(patterns), found.shares)
 
 
 @phase("candidates")

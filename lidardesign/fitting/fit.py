@@ -29,7 +29,7 @@ from lidardesign.fitting.request import COUNTS, KEY, WORLD, FitRequest, FitResul
 from lidardesign.formats.designs import relative_folder
 from lidardesign.mixture.fit import FitProblem, FittedSensors, fit_sensors
 from lidardesign.mixture.support import LEAST_SAMPLES, MOVED_SAMPLES, Retarget, at_condition, condition_text
-from lidardesign.rays.information import checked_information
+from lidardesign.rays.information import FEW_SCENES, checked_information, features_of
 from lidardesign.rays.proposals import nearest_samples
 from lidardesign.rays.training import CHOICE, TrainingScenes
 from lidardesign.registry import plugin_guard
@@ -328,9 +328,12 @@ class Fitter:
                 certified=() if is_trial or not certifies else counts if request.certify else (middle,),
                 each_fires=not may_idle,
                 is_trial=is_trial,
+                most_patterns=0 if is_trial or request.adaptive < 2 else request.adaptive,
                 progress=ignore if is_trial else self.progress,
             )
             design = replace(design, sensors=chosen.sensors, patterns=chosen.patterns, certificates=chosen.certificates)
+            if request.adaptive > 1 and not is_trial:
+                design = self._if_better(replace(design, adaptive=chosen.adaptive), notes)
             if chosen.silent > MOST_SILENT:
                 notes.append(
                     f"about {chosen.silent:.0%} of the training scenes that were held back, no ray tells anything; "
@@ -345,6 +348,31 @@ class Fitter:
             design = replace(design, constraints=merged(design.constraints, {"budget": {"rays": fitted.rays}}))
         result = FitResult.of_fit(design, fitted, self.samples, time.perf_counter() - started)
         return replace(result, notes=(*notes, *result.notes))
+
+    def _if_better(self, design: DesignSpec, notes: list[str]) -> DesignSpec:
+        """The design with its adaptive patterns where they score better on training scenes held back, else without."""
+        from lidardesign.fitting.trials import Trial, trial_of
+
+        metric, adaptive = self.request.run.metric, design.adaptive
+        if adaptive is None:
+            notes.append("one pattern: training scenes are too few, or too much alike, for several")
+            return design
+        with phase("trials"):
+            fixed = trial_of(self.request, design, len(adaptive))
+            features = features_of(self.training.run.task)
+            following = Trial(fixed.sensors, adaptive.rays(features)).lit(self.request, design)
+            self.scenes.score([fixed, following], FEW_SCENES)
+        before, after = fixed.scores.mean(), following.scores.mean()
+        looks = f" behind a first look of {adaptive.rule.looks} rays" if adaptive.rule.looks else ""
+        text = (
+            f"{len(adaptive.patterns)} patterns{looks} score {after:.4g} {metric.unit} on training scenes held back, "
+        )
+        text += f"the best single one {before:.4g}"
+        if (after < before) == (metric.better == "lower") and after != before:
+            notes.append(text)
+            return design
+        notes.append(f"one pattern: {text}")
+        return replace(design, adaptive=None)
 
     def _best_count(self) -> int:
         """The number of sensors that scores best on training scenes, with a note on those tried."""

@@ -19,6 +19,7 @@ from lidardesign.sensors.sensor import LEVELS, MOST_RAYS
 
 BEST = "best"  # as many sensors as score best on training scenes
 LEAST = ("bandwidth", "rays", "sensors", "parts")  # of what a design for a goal has as little as it can
+MOST_PATTERNS = 64  # that follow what they see
 # Of designs: names that a file may have everywhere.
 NAME_PATTERN = re.compile(r"[^\W.][\w.+-]{0,99}")
 
@@ -48,6 +49,7 @@ class FitOptions:
         survive: 1: rays are chosen for the loss of any one sensor, too; by default as constraints say.
         goal: The score that the design has to keep on training scenes that were held back, in the metric's unit.
         least: What it then has the least of: bandwidth, rays, sensors or parts.
+        adaptive: At most so many patterns follow what they see; 1 for none, by default as the design.
 
     Raises:
         ConfigError: An invalid name, layout, choice of gates or of what is least.
@@ -72,6 +74,7 @@ class FitOptions:
     survive: int | None = None
     goal: float | None = None
     least: str | None = None
+    adaptive: int | None = None
 
     def __post_init__(self) -> None:
         if self.name is not None and not NAME_PATTERN.fullmatch(self.name):
@@ -87,7 +90,7 @@ class FitOptions:
             allowed = f"a whole number from 1 to {MOST_FITTED}, best, or with parts numbers such as 1-4"
             raise ConfigError(repr(self.sensors), where="--sensors", allowed=allowed)
         limits = {"rays": (1, MOST_RAYS), "channels": (1, MOST_FITTED), "seed": (0, MAX_SEED)}
-        limits["survive"] = (0, 1)
+        limits |= {"survive": (0, 1), "adaptive": (1, MOST_PATTERNS)}
         for name, (low, high) in limits.items():
             if getattr(self, name) is not None:
                 check_number(getattr(self, name), f"--{name}", low, high, whole=True)
@@ -129,6 +132,9 @@ def check_layout(layout: LayoutName, constraints: Constraints, run: RunFolder, o
         ("spinning sensors with --at or --weight", "--layout", "chosen, even"): (
             layout == "spinning" and (bool(options.at) or bool(options.weights))
         ),
+        (f"patterns that follow what they see in {place}", "--adaptive", "--layout chosen, without parts"): (
+            (options.adaptive or 1) > 1 and (place != "the layout chosen" or bool(constraints.survive))
+        ),
         (f"{options.sensors!r} sensors that spin", "--sensors", "a whole number"): (
             layout == "spinning" and isinstance(options.sensors, str)
         ),
@@ -147,6 +153,9 @@ def check_goal(layout: LayoutName, constraints: Constraints, run: RunFolder, opt
         ("no goal", "--least", "--goal SCORE --least WHAT"): goal is None and least is not None,
         ("a goal for sensors that spin", "--goal", "the layouts chosen and even"): (
             goal is not None and layout == "spinning"
+        ),
+        ("a goal for patterns that follow what they see", "--adaptive", "one of both"): (
+            goal is not None and (options.adaptive or 1) > 1
         ),
         (f"{least} of a design of parts", "--least", "parts"): are_parts and least not in (None, "parts"),
         ("no parts are named", "--least parts", "--parts NAME,NAME"): not are_parts and least == "parts",

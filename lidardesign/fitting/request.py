@@ -72,6 +72,7 @@ class FitRequest:
         settings: Settings of the task for the scenes that designs are chosen and judged in.
         goal: The score that it has to keep, with the least of `least`; None leaves nothing to be sought.
         least: One of `LEAST`.
+        adaptive: At most so many patterns follow what they see; 1: none do.
     """
 
     run: RunFolder
@@ -94,6 +95,7 @@ class FitRequest:
     fewest: int | None = None
     goal: float | None = None
     least: str = LEAST[0]
+    adaptive: int = 1
 
     @classmethod
     def resolve(
@@ -177,6 +179,7 @@ class FitRequest:
             fewest=None if options.numbers is None else options.numbers[0],
             goal=options.goal,
             least=options.least or ("bandwidth" if rules.parts is None else "parts"),
+            adaptive=_patterns(options, base, space, layout),
         )
 
     @property
@@ -203,8 +206,9 @@ class FitRequest:
 
     @property
     def counts(self) -> list[int]:
-        """The numbers of rays that are chosen, ascending."""
-        return sorted({self.rays} if self.rays else set(self.run.task.defaults.rays))
+        """The numbers of rays that are chosen, ascending; patterns that follow what they see have one."""
+        every = sorted({self.rays} if self.rays else set(self.run.task.defaults.rays))
+        return every[len(every) // 2 :][:1] if self.adaptive > 1 else every
 
 
 @dataclass(frozen=True)
@@ -251,6 +255,21 @@ def _layout(constraints: Constraints, base: DesignSpec | None, run: RunFolder, o
     if base is not None and base.layout in FITTED_LAYOUTS:
         return base.layout
     return "chosen" if informs_rays(run.task) and options.like is None else "even"
+
+
+def _patterns(options: FitOptions, base: DesignSpec | None, space: DesignSpace, layout: LayoutName) -> int:
+    """The user's largest number of patterns that follow what they see, else the design's; 1 for none.
+
+    Raises:
+        ConfigError: The rays follow a condition already.
+    """
+    most = options.adaptive
+    if most is None:
+        most = 1 if base is None or base.adaptive is None or layout != "chosen" else len(base.adaptive.patterns) - 1
+    if most > 1 and space.conditioned:
+        names = " and ".join(DIMENSIONS[axis] for axis in space.conditioned)
+        raise ConfigError(f"rays follow {names} already", where="--adaptive", hint=f"give --at {names}=VALUE")
+    return most
 
 
 def _check_conditions(constraints: Constraints, space: DesignSpace) -> None:

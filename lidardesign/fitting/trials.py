@@ -24,7 +24,8 @@ from lidardesign.rays.training import HELD_BACK, TrainingScenes
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Scene, group_numbers
 from lidardesign.scoring.scene_scores import score_lists, without_each
-from lidardesign.sensors.bandwidth import Bandwidth, mean_mbps
+from lidardesign.sensors.adaptive import mapped, mean_mbps
+from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.simulate.plan import Decision, EffectPlan, Planner
 from lidardesign.simulate.returns import build_casters
@@ -61,6 +62,16 @@ class Trial:
     def mbps(self) -> float:
         """Its bandwidth by the read-out model of evaluations [Mbit/s]."""
         return mean_mbps(self.fired, Bandwidth())
+
+    def lit(self, request: FitRequest, design: DesignSpec) -> Trial:
+        """The trial with the light that the request's detector has in parts of the design."""
+        if request.planner is None:
+            return self
+        from lidardesign.simulate.calibration import with_part_light
+
+        return replace(
+            self, fired=mapped(self.fired, lambda one: with_part_light(one, design, request.planner.detector))
+        )
 
     def fires_as(self, other: Trial) -> bool:
         """True where another design fires the same rays."""
@@ -166,12 +177,7 @@ def trial_of(request: FitRequest, design: DesignSpec, rays: int | None) -> Trial
     """A design with so many rays, or its own, wherever the request's sensors are."""
     run = request.run
     conditions = [{**request.at, **one} for one in run.conditions(run.config.space.at(request.at))]
-    fired = tuple(design.rays(rays, at=at or None) for at in conditions)
-    if request.planner is not None:
-        from lidardesign.simulate.calibration import with_part_light
-
-        fired = tuple(with_part_light(one, design, request.planner.detector) for one in fired)
-    return Trial(len(design.sensors), fired)
+    return Trial(len(design.sensors), tuple(design.rays(rays, at=at or None) for at in conditions)).lit(request, design)
 
 
 def best_of(

@@ -77,6 +77,7 @@ class _Search:
     def __init__(self, coverage: Coverage, counts: RayCounts) -> None:
         self.coverage, self.group, self.left = coverage, counts.group, counts.most.copy()
         self.owner = counts.owner
+        self.kept = np.zeros(coverage.shape[0], dtype=bool)
         self.cost = coverage.harm
         self.limit_mbps, self.spent_mbps = np.inf, 0.0
         self.gate = np.full(coverage.shape[0], -1)
@@ -97,6 +98,12 @@ class _Search:
             self.fill(full)
             if not changed:
                 return
+
+    def keep(self, gate: np.ndarray) -> None:
+        """Take rays that fire in any case, with their gates, -1 for others, (N,)."""
+        for ray in np.flatnonzero(gate >= 0):
+            self.take(int(ray), int(gate[ray]))
+        self.kept = gate >= 0
 
     def choice(self, price: float) -> Choice:
         """The choice so far."""
@@ -173,7 +180,7 @@ class _Search:
     def swap(self, full: bool, smallest: float) -> bool:
         """Swap each chosen ray for the best other one where that gains; return whether anything changed."""
         changed, entries = False, self.coverage.entries
-        for ray in np.flatnonzero(self.gate >= 0):
+        for ray in np.flatnonzero((self.gate >= 0) & ~self.kept):
             gate = int(self.gate[ray])
             if self.owner is not None and np.count_nonzero(self.gate[self.owner == self.owner[ray]] >= 0) == 1:
                 continue  # the only ray of its sensor
@@ -200,6 +207,7 @@ def choose(
     price: float = 0.0,
     full: bool = True,
     passes: int = MOST_PASSES,
+    kept: np.ndarray | None = None,
 ) -> Choice:
     """Rays and gates of large F - price * bits - harm.
 
@@ -209,8 +217,9 @@ def choose(
         price: Price of 1 Mbit/s, in the unit of worth.
         full: Whether counts are filled even with rays that gain nothing.
         passes: Largest number of swaps of each ray.
+        kept: Gates of rays that fire in any case, -1 for others, (N,).
     """
-    return _choose_layers(coverage, counts, (price,), np.inf, full=full, passes=passes)
+    return _choose_layers(coverage, counts, (price,), np.inf, full=full, passes=passes, kept=kept)
 
 
 def _choose_layers(
@@ -222,9 +231,12 @@ def _choose_layers(
     full: bool,
     passes: int,
     layered: bool = True,
+    kept: np.ndarray | None = None,
 ) -> Choice:
     """Layers of rays at the first price, or all rays in one; the last layer is improved at the other prices too."""
     search = _Search(coverage, counts)
+    if kept is not None:
+        search.keep(kept)
     search.improve(prices[0], limit_mbps, full=full, passes=passes if layered else 0)
     while layered and full and search.is_open:
         search.begin_layer()
@@ -243,6 +255,7 @@ def choose_within(
     *,
     full: bool = True,
     passes: int = MOST_PASSES,
+    kept: np.ndarray | None = None,
 ) -> Choice:
     """The best choice found within a bandwidth; as `choose`, with a budget [Mbit/s] instead of a price.
 
@@ -250,12 +263,12 @@ def choose_within(
     least price within the budget is spent at the next lower price, then at none.
     """
     budget_mbps *= 1 + SLACK  # the same bits added up in another order
-    free = choose(coverage, counts, full=full, passes=passes)
+    free = choose(coverage, counts, full=full, passes=passes, kept=kept)
     if free.bits <= budget_mbps:
         return free
     low, high = 0.0, (free.worth or 1.0) / free.bits  # a price has to rise from above 0
     for _ in range(BISECTIONS):
-        tried = choose(coverage, counts, price=high, full=full, passes=0).bits
+        tried = choose(coverage, counts, price=high, full=full, passes=0, kept=kept).bits
         if tried <= budget_mbps:
             break
         low, high = high, 4 * high
@@ -263,13 +276,15 @@ def choose_within(
         if tried >= NEAR_BUDGET * budget_mbps and tried <= budget_mbps:
             break
         middle = (low + high) / 2
-        bits = choose(coverage, counts, price=middle, full=full, passes=0).bits
+        bits = choose(coverage, counts, price=middle, full=full, passes=0, kept=kept).bits
         if bits <= budget_mbps:
             high, tried = middle, bits
         else:
             low = middle
-    found = _choose_layers(coverage, counts, (high, low, 0.0), budget_mbps, full=full, passes=passes)
+    found = _choose_layers(coverage, counts, (high, low, 0.0), budget_mbps, full=full, passes=passes, kept=kept)
     if full and len(found.rays) < len(free.rays):
         # swaps spent what further layers need
-        return _choose_layers(coverage, counts, (high, low, 0.0), budget_mbps, full=True, passes=passes, layered=False)
+        return _choose_layers(
+            coverage, counts, (high, low, 0.0), budget_mbps, full=True, passes=passes, layered=False, kept=kept
+        )
     return found

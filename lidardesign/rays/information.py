@@ -10,6 +10,7 @@ import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
+from functools import partial
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from lidardesign.numerics import SLACK
 from lidardesign.registry import plugin_guard
 from lidardesign.scenes.rays import Returns
 from lidardesign.scenes.scene import Scene
+from lidardesign.sensors.adaptive import Features
 from lidardesign.task import Information, Task
 
 # Numbers of scenes that rays are chosen on, at first and at most; as many as at first are held back.
@@ -68,6 +70,28 @@ def checked_information(task: Task, scene: Scene, returns: Sequence[Returns]) ->
         raise PluginError(f"informs returned {type(answer).__name__}", where=where, allowed=allowed)
     require_valid(answer, len(returns[0].rays) if len(returns) else 0, len(returns), where)
     return answer
+
+
+def features_of(task: Task) -> Features | None:
+    """The features of a frame's returns by a task, checked, (F,); None where it has no method `features`.
+
+    Raises:
+        PluginError: When called: the task's code raised, or returned something that is not a list of numbers.
+    """
+    return partial(_checked_features, task) if callable(getattr(task, "features", None)) else None
+
+
+def _checked_features(task: Task, scene: Scene, returns: Returns) -> np.ndarray:
+    with plugin_guard(task.name):
+        found = task.features(scene, returns)
+    where = f"task {task.name}, features, scene {scene.name}"
+    try:
+        features = np.asarray(found, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise PluginError(f"features returned {found!r}", where=where, allowed="a list of numbers") from None
+    if features.ndim != 1 or not len(features):
+        raise PluginError(f"features of shape {features.shape}", where=where, allowed="(F,), the numbers of a frame")
+    return features
 
 
 def require_valid(information: Information, rays: int, frames: int, where: str = "task") -> None:

@@ -198,11 +198,15 @@ class Selected:
             `rays`, `candidates`, `gates` and `scenes`, and `curve`, the price curve as pairs of Mbit/s and loss; None
             where it was not asked for.
         silent: The share of scenes held back about which the rays have no information.
+        choice: The choice of all candidates, with its price of bandwidth.
+        gates_m: The gates of candidates that it chooses from, (N, G, 2) [m].
     """
 
     rays: Sequence[Rays]
     certificate: dict[str, Any] | None
     silent: float
+    choice: Choice
+    gates_m: np.ndarray
 
 
 def select(
@@ -263,7 +267,8 @@ def select(
             )
             document["curve"] = price_curve(coverage, selection.counts(count), len(selection.visits))
         fired = np.where(gate[:, None] >= 0, gates_m[np.arange(len(rays)), gate], 0.0)
-        selected.append(Selected(tables, document, silent_share(held_back, fired)))
+        silent = silent_share(held_back, fired)
+        selected.append(Selected(tables, document, silent, replace(choices[0], gate=gate), gates_m))
     return selected
 
 

@@ -22,6 +22,7 @@ from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import Rays, Returns
 from lidardesign.scenes.scene import Scene
 from lidardesign.scenes.triangles import SecondCasts
+from lidardesign.sensors.adaptive import AdaptiveRays, returns_of
 from lidardesign.simulate.detector.physics import Physics
 from lidardesign.simulate.plan import EffectPlan, Planner
 from lidardesign.simulate.returns import build_casters, simulate_many
@@ -96,16 +97,21 @@ def score_lists(
                 lists,
                 casters=casters,
                 physics=physics,
-                repeats=[number for positions in group for number in range(len(positions))],
+                repeats=[number for positions in group for number in _repeats(positions)],
             )
         )
         rays = sum(_count(positions) for positions in group)
         per_ray = (time.perf_counter() - started) / max(rays, 1)
         for positions in group:
-            returns = [frame for _ in positions for frame in next(found)]
+            returns = returns_of(positions, scene, [next(found) for _ in positions])
             started = time.perf_counter()
             score = checked_score(task, metric, scene, returns)
             yield score, time.perf_counter() - started + per_ray * _count(positions)
+
+
+def _repeats(positions: RaysPerCondition) -> Sequence[int]:
+    """The random draw of each list of rays: another at every condition value, the same for patterns of one frame."""
+    return [0] * len(positions) if isinstance(positions, AdaptiveRays) else range(len(positions))
 
 
 def without_each(positions: RaysPerCondition, sensors: int) -> list[RaysPerCondition]:

@@ -7,7 +7,6 @@ of every ray is read out once per frame, so the bandwidth is sum(bins) * bits * 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -105,8 +104,3 @@ def split_budget(weights: np.ndarray, count: int, *, each: bool = False) -> np.n
     while each and shares.min() == 0 and shares.max() > 1:
         shares[[shares.argmax(), shares.argmin()]] += [-1, 1]
     return shares
-
-
-def mean_mbps(positions: Sequence[Rays], bandwidth: Bandwidth) -> float:
-    """The bandwidth of rays, averaged over condition values [Mbit/s]."""
-    return math.fsum(bandwidth.mbps(rays) for rays in positions) / len(positions)

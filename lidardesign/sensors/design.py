@@ -15,6 +15,7 @@ import numpy as np
 
 from lidardesign.errors import ConfigError
 from lidardesign.scenes.rays import DEFAULT_RATE_HZ, Rays, fire_times
+from lidardesign.sensors.adaptive import AdaptivePatterns
 from lidardesign.sensors.bandwidth import split_budget
 from lidardesign.sensors.pattern import TRAVELLED, Pattern, even_rays, even_subset, with_coordinates
 from lidardesign.sensors.sensor import DEFAULT_LEVEL, Sensor
@@ -44,6 +45,7 @@ class DesignSpec:
         level: The share of each marginal that fields of view and gates hold.
         at: The condition values that the design is for, where it is for one, as {"x_m": 0.37}.
         mount: The body of a robot that it is on, in whose frame places and directions are; None: in the world.
+        adaptive: Patterns that follow what they see, with as many rays as one of `patterns`; None without.
     """
 
     name: str
@@ -56,6 +58,7 @@ class DesignSpec:
     level: float = DEFAULT_LEVEL
     at: Mapping[str, float] = field(default_factory=dict)
     mount: str | None = None
+    adaptive: AdaptivePatterns | None = None
 
     @property
     def frame(self) -> str:

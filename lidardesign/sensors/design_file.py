@@ -14,10 +14,11 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from lidardesign.errors import ConfigError, page
-from lidardesign.numerics import SLACK
+from lidardesign.numerics import COARSE_SLACK, SLACK
 from lidardesign.run.files import write_atomic
 from lidardesign.run.validation import check_model, is_name
 from lidardesign.run.yaml import KeyPath, dump_yaml
+from lidardesign.sensors.adaptive import AdaptivePatterns, PatternRule
 from lidardesign.sensors.design import DesignSpec, LayoutName
 from lidardesign.sensors.pattern import Pattern
 from lidardesign.sensors.sensor import DEFAULT_LEVEL, LEVELS, Sensor
@@ -154,6 +155,43 @@ class MountEntry(_Keys):
     body: Name
 
 
+class AdaptiveEntry(_Keys):
+    """Patterns that follow what they see: the first fires where nothing is known, the others near their centroid."""
+
+    looks: Annotated[int, Field(ge=0)] = 0
+    missing_m: list[Distance] = []
+    centroids: Annotated[list[list[float]], Field(min_length=1)]
+    shares: list[Annotated[float, Field(ge=0, le=1)]]
+    patterns: list[PatternEntry]
+
+    @model_validator(mode="after")
+    def _whole(self) -> AdaptiveEntry:
+        count, rays = len(self.centroids), {len(pattern.sensor) for pattern in self.patterns}
+        if len(self.patterns) != count + 1 or len(self.shares) != count + 1:
+            raise ValueError(
+                f"{count} centroids have {count + 1} patterns and shares, the first where nothing is known"
+            )
+        if abs(math.fsum(self.shares) - 1) > COARSE_SLACK:
+            raise ValueError("shares do not sum to 1")
+        if len(rays) > 1 or any(pattern.dimension for pattern in self.patterns):
+            raise ValueError("patterns that follow what they see have equal numbers of rays, and no dimension")
+        sizes = {len(centroid) for centroid in self.centroids}
+        if len(sizes) > 1 or 0 in sizes or (self.looks and sizes != {self.looks}):
+            raise ValueError("centroids have one number for each feature: of a first look one for each of its rays")
+        if len(self.missing_m) != self.looks or self.looks > min(rays):
+            raise ValueError("missing_m has a range for each ray of the first look, which every pattern begins with")
+        for name in (*COLUMNS, "sensor"):
+            begun = [row[: self.looks] for row in (_only_row(pattern, name) for pattern in self.patterns)]
+            if any(one != begun[0] for one in begun):
+                raise ValueError(f"patterns differ in {name} of the first look")
+        return self
+
+
+def _only_row(pattern: PatternEntry, name: str) -> list[Any]:
+    column = getattr(pattern, name)
+    return column if name == "sensor" else column[0]
+
+
 class DesignFile(_Keys):
     """A LiDAR design: sensors, the patterns that they fire, and the constraints that they keep. Metres and radians."""
 
@@ -165,6 +203,7 @@ class DesignFile(_Keys):
     patterns: list[PatternEntry] = []
     at: dict[Literal[DIMENSIONS], Coordinate] = {}  # type: ignore[valid-type]
     mount: MountEntry | None = None
+    adaptive: AdaptiveEntry | None = None
     constraints: dict[str, Any] = {}
     certificates: list[dict[str, Any]] = []
     provenance: dict[str, Any] = {}
@@ -189,8 +228,11 @@ class DesignFile(_Keys):
             raise ValueError("several patterns are for the layout chosen, by ascending numbers of rays")
         if len({pattern.dimension for pattern in self.patterns}) > 1:
             raise ValueError("patterns follow different conditions")
-        if any(max(pattern.sensor) >= len(self.sensors) for pattern in self.patterns):
+        every = [*self.patterns, *(self.adaptive.patterns if self.adaptive else [])]
+        if any(max(pattern.sensor) >= len(self.sensors) for pattern in every):
             raise ValueError(f"a pattern names a sensor beyond the last of {len(self.sensors)}, counted from 0")
+        if self.adaptive is not None and len(self.adaptive.patterns[0].sensor) not in sizes:
+            raise ValueError("no pattern has as many rays as the adaptive ones: it is what fires without a rule")
         return self
 
 
@@ -209,11 +251,24 @@ def design_document(design: DesignSpec) -> dict[str, Any]:
         document["at"] = {name: float(value) for name, value in design.at.items()}
     if design.mount is not None:
         document["mount"] = {"body": design.mount}
+    if design.adaptive is not None:
+        document["adaptive"] = _adaptive_document(design.adaptive)
     document["constraints"] = design.constraints
     if design.certificates:
         document["certificates"] = [*design.certificates]
     document["provenance"] = design.provenance
     return document
+
+
+def _adaptive_document(adaptive: AdaptivePatterns) -> dict[str, Any]:
+    rule = adaptive.rule
+    look = {"looks": rule.looks, "missing_m": rule.missing_m.tolist()} if rule.looks else {}
+    return {
+        **look,
+        "centroids": rule.centroids.tolist(),
+        "shares": adaptive.shares.tolist(),
+        "patterns": [pattern_document(pattern) for pattern in adaptive.patterns],
+    }
 
 
 def pattern_document(pattern: Pattern) -> dict[str, Any]:
@@ -247,7 +302,8 @@ def design_text(design: DesignSpec, path: Path) -> str:
         NumericalError: The design holds a number that is not finite.
         ConfigError: More rays than a file can be read back with.
     """
-    rays = sum(pattern.azimuth_rad.size for pattern in design.patterns)
+    every = (*design.patterns, *(design.adaptive.patterns if design.adaptive else ()))
+    rays = sum(pattern.azimuth_rad.size for pattern in every)
     if rays > MOST_FILE_RAYS:
         raise ConfigError(
             f"{rays} rays in all patterns and at all knots",
@@ -309,7 +365,13 @@ def _design(file: DesignFile, stem: str) -> DesignSpec:
         level=file.level,
         at=file.at,
         mount=None if file.mount is None else file.mount.body,
+        adaptive=None if file.adaptive is None else _adaptive(file.adaptive),
     )
+
+
+def _adaptive(entry: AdaptiveEntry) -> AdaptivePatterns:
+    rule = PatternRule(np.array(entry.centroids), entry.looks, np.array(entry.missing_m, dtype=np.float64))
+    return AdaptivePatterns(rule, tuple(map(_pattern, entry.patterns)), np.array(entry.shares))
 
 
 def _sensors(entries: list[SensorEntry]) -> Iterator[Sensor]:

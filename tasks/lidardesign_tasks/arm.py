@@ -117,6 +117,11 @@ class ArmTask:
         """Information of returns on the ball about its position in their own and in neighbouring frames."""
         return path_information(returns, [np.array([_target(scene)])], scene.truth["ball_m"][None])
 
+    def features(self, scene: Scene, returns: Returns) -> np.ndarray:
+        """The tracked place of the ball in a frame, (3,) [m]; not a number without a return of it."""
+        _, places = _tracked(scene, [returns])
+        return places[0] if len(places) else np.full(3, np.nan)
+
 
 def _tracked(scene: Scene, returns: Sequence[Returns]) -> tuple[np.ndarray, np.ndarray]:
     """Frames with returns of the ball, and its position in each [m], see `tracked_places`.

@@ -26,7 +26,8 @@ from lidardesign.scoring.baselines.views import TrainingObjective
 from lidardesign.scoring.evaluation.entries import entries_of
 from lidardesign.scoring.evaluation.request import EvaluationRequest
 from lidardesign.scoring.evaluation.score import evaluate
-from lidardesign.sensors.bandwidth import Bandwidth, mean_mbps
+from lidardesign.sensors.adaptive import mean_mbps
+from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.pattern import Pattern, even_rays
 from lidardesign.simulate.plan import Planner

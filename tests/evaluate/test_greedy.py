@@ -19,7 +19,8 @@ from lidardesign.scoring.baselines.greedy import Fired, GreedyCandidate, greedy_
 from lidardesign.scoring.baselines.views import TrainingViews
 from lidardesign.scoring.evaluation.entries import entries_of
 from lidardesign.scoring.evaluation.score import evaluate
-from lidardesign.sensors.bandwidth import Bandwidth, mean_mbps
+from lidardesign.sensors.adaptive import mean_mbps
+from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design import CERTIFIED
 from lidardesign.sensors.pattern import Pattern
 from lidardesign.simulate.returns import simulate

@@ -20,7 +20,8 @@ from lidardesign.fitting.request import FitRequest, RunTarget
 from lidardesign.run_folder import RunFolder
 from lidardesign.scoring.baselines.greedy import Fired
 from lidardesign.scoring.baselines.simple import TwinCandidate
-from lidardesign.sensors.bandwidth import Bandwidth, mean_mbps
+from lidardesign.sensors.adaptive import mean_mbps
+from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import design_document
 from lidardesign.sensors.pattern import Pattern

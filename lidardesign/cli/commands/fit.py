@@ -41,6 +41,7 @@ def fit(
     survive: options.Survive = None,
     goal: options.Goal = None,
     least: options.Least = None,
+    adaptive: options.Adaptive = None,
     workers: options.Workers = "1",
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -72,6 +73,7 @@ def fit(
             survive=survive,
             goal=goal,
             least=least,
+            adaptive=adaptive,
         )
         run_fit(FitRequest.resolve(RunFolder.open(run), chosen, notes=output.remark), output, workers)
 
@@ -140,6 +142,7 @@ def constrain(
     survive: options.Survive = None,
     goal: options.Goal = None,
     least: options.Least = None,
+    adaptive: options.Adaptive = None,
     workers: options.Workers = "1",
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -176,5 +179,6 @@ def constrain(
             survive=survive,
             goal=goal,
             least=least,
+            adaptive=adaptive,
         )
         run_fit(FitRequest.resolve(run, chosen, design, notes=output.remark), output, workers)

@@ -222,6 +222,10 @@ Least = Annotated[
     str | None,
     typer.Option("--least", metavar=LEAST, help="What --goal saves; else bandwidth.", autocompletion=words(LEAST)),
 ]
+Adaptive = Annotated[
+    int | None,
+    typer.Option("--adaptive", metavar="N", help="At most so many patterns follow what they see.", show_default="1"),
+]
 Preset = Annotated[
     str | None,
     typer.Option(

@@ -16,7 +16,8 @@ import numpy as np
 from lidardesign.numerics import EPSILON
 from lidardesign.scenes.rays import Rays, fire_times
 from lidardesign.scoring.scene_scores import RaysPerCondition
-from lidardesign.sensors.bandwidth import Bandwidth, mean_mbps
+from lidardesign.sensors.adaptive import mean_mbps
+from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.sensor import MOST_RAYS
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction
 

@@ -28,7 +28,8 @@ from lidardesign.run.clock import phase
 from lidardesign.scenes.rays import Rays
 from lidardesign.scoring.baselines.views import OutOfTimeError, TrainingObjective
 from lidardesign.scoring.scene_scores import RaysPerCondition
-from lidardesign.sensors.bandwidth import Bandwidth, mean_mbps
+from lidardesign.sensors.adaptive import mean_mbps
+from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.sensor import boresight_frame, interval_factor
 from lidardesign.space import DesignSpace, angles, direction

@@ -27,7 +27,8 @@ from lidardesign.scoring.baselines.simple import Baselines, Option, TwinCandidat
 from lidardesign.scoring.baselines.views import TrainingObjective, TrainingViews
 from lidardesign.scoring.evaluation.request import EvaluationRequest, fired_numbers, numbers_fired
 from lidardesign.scoring.scene_scores import ONE_DEVICE, Devices, RaysPerCondition, score_scenes
-from lidardesign.sensors.bandwidth import Bandwidth, mean_mbps
+from lidardesign.sensors.adaptive import mean_mbps
+from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design import DesignSpec, certificates_of
 from lidardesign.simulate.detector.physics import EFFECTS
 from lidardesign.simulate.plan import Choice, EffectPlan, Tolerance
@@ -42,6 +43,7 @@ MOST_BASELINE_SCENES = 20
 FEWEST_BASELINE_SCENES = 5
 LARGEST_BASELINE_SHARE = 0.1  # of the rays that an evaluation fires may be fired to find it
 MILLIMETRES = 1000.0
+SINGLE = "-single"  # ends the name of the best single pattern of a design whose patterns follow what they see
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,9 +106,10 @@ def entries_of(request: EvaluationRequest) -> list[Entry]:
     _check_ends(request, conditions)
     counts = fired_numbers(request.designs, request.rays)
     designs = [
-        Entry(design.name, _laid_out(request, conditions, design, count), baseline=False)
+        entry
         for design in request.designs
         for count in numbers_fired(design, counts, request.alone)
+        for entry in _of_design(request, conditions, design, count)
     ]
     shared = [count for count in counts if count not in request.alone]
     choosable = [] if request.training is None else greedy_rays(request.task, len(conditions), shared)[0]
@@ -186,6 +189,17 @@ def _conditions(request: EvaluationRequest) -> list[dict[str, float]]:
 def ordered_conditions(request: EvaluationRequest) -> list[dict[str, float]]:
     """The condition values that are evaluated at, ascending; one empty entry without conditions."""
     return sorted(_conditions(request), key=lambda condition: tuple(condition.values()))
+
+
+def _of_design(
+    request: EvaluationRequest, conditions: Sequence[Mapping[str, float]], design: DesignSpec, count: int
+) -> list[Entry]:
+    """The entry of a design; where its patterns follow what they see, with the best single one beside it."""
+    fixed = Entry(design.name, _laid_out(request, conditions, design, count), baseline=False)
+    if design.adaptive is None or count != len(design.adaptive):
+        return [fixed]
+    following = request.following(design, design.adaptive)
+    return [replace(fixed, positions=following), replace(fixed, name=f"{design.name}{SINGLE}")]
 
 
 def _laid_out(

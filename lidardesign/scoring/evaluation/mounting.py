@@ -19,6 +19,7 @@ from lidardesign.errors import ConfigError
 from lidardesign.run.yaml import plain_number
 from lidardesign.scenes.rays import Rays
 from lidardesign.scoring.scene_scores import RaysPerCondition
+from lidardesign.sensors.adaptive import mapped
 from lidardesign.task import random_generator
 
 OPTION = "--mount-error"
@@ -70,7 +71,7 @@ class MountError:
         sensors = max((int(rays.sensor.max(initial=-1)) for rays in positions), default=-1) + 1
         draws = random_generator(seed, "mounting", scene).normal(size=(sensors, 6))
         turn = Rotation.from_rotvec(self.angle_rad * draws[:, 3:]).as_matrix() if sensors else np.zeros((0, 3, 3))
-        return tuple(_moved(rays, self.place_m * draws[:, :3], turn) for rays in positions)
+        return mapped(positions, lambda rays: _moved(rays, self.place_m * draws[:, :3], turn))
 
 
 def _moved(rays: Rays, shift_m: np.ndarray, turn: np.ndarray) -> Rays:

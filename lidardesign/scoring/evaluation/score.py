@@ -36,6 +36,7 @@ from lidardesign.scoring.evaluation.mounting import MountError
 from lidardesign.scoring.evaluation.request import EvaluationRequest, left_out
 from lidardesign.scoring.evaluation.results import Audit, Evaluation, Mounting, Paired, Row, audit_rows, middle_rays
 from lidardesign.scoring.scene_scores import RaysPerCondition, score_scenes, silent_notes, without_each
+from lidardesign.sensors.adaptive import AdaptiveRays
 from lidardesign.sensors.compare import outside_notes
 from lidardesign.sensors.sensor import MOST_RAYS
 from lidardesign.simulate.calibration import light_notes
@@ -141,7 +142,7 @@ def _losses(
     lost = {
         (number, sensor): replace(entry, name=f"{entry.name}/{sensor}", positions=left)
         for number, entry in enumerate(entries)
-        if not entry.baseline and entry.name in request.losing
+        if not entry.baseline and entry.name in request.losing and not isinstance(entry.positions, AdaptiveRays)
         for sensor, left in enumerate(without_each(entry.positions, request.losing[entry.name]))
     }
     scored = _score_all(request, list(lost.values()), request.planner, progress, plans)
@@ -256,7 +257,7 @@ def _bandwidth_pairs(rows: Sequence[Row], matched: Sequence[Row], metric: Metric
 
 
 def _notes(request: EvaluationRequest, entries: Sequence[Entry], matched: Sequence[Row]) -> list[str]:
-    positions = max(len(entry.positions) for entry in entries)
+    positions = max(len(entry.positions) for entry in entries if not isinstance(entry.positions, AdaptiveRays))
     notes = left_out(request.designs, request.rays, request.alone)
     if positions > 1:
         counted = f"rays and bandwidth count per position; every scene is seen from {positions} positions"

@@ -57,6 +57,12 @@ def informs(scene: Scene, returns: Sequence[Returns]) -> Information:
     return _INFORMS[scene.truth["measure"]](scene, [_told_apart(scene, one) for one in returns])
 
 
+def features(scene: Scene, returns: Returns) -> np.ndarray:
+    """The mean place of what is taken for a target in a frame, (3,) [m]; not a number without any."""
+    one = _told_apart(scene, returns)
+    return one.points_m.mean(axis=0) if one.returned.any() else np.full(3, np.nan)
+
+
 def _told_apart(scene: Scene, one: Returns) -> Returns:
     """The returns without those on known bodies."""
     gone = one.returned & scene.truth["known"][one.body]

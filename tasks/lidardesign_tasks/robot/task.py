@@ -31,7 +31,7 @@ from lidardesign.task import (
     Vector,
     random_generator,
 )
-from lidardesign_tasks.robot.measures import METRICS, TOLERATED_SHARE, Measure, informs, score, with_truth
+from lidardesign_tasks.robot.measures import METRICS, TOLERATED_SHARE, Measure, features, informs, score, with_truth
 from lidardesign_tasks.robot.motion import (
     Trajectory,
     keyframes,
@@ -180,6 +180,10 @@ class MujocoTask:
     def informs(self, scene: Scene, returns: Sequence[Returns]) -> Information:
         """Information of returns by the metric of the configuration."""
         return informs(scene, returns)
+
+    def features(self, scene: Scene, returns: Returns) -> np.ndarray:
+        """The mean place of what is taken for a target, (3,) [m]; not a number where nothing is."""
+        return features(scene, returns)
 
 
 def model_of(config: MujocoConfig) -> Model:
