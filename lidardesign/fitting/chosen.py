@@ -15,8 +15,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidardesign.constraints.document import Constraints, SensorRules, rules_of
+from lidardesign.constraints.document import SensorRules, rules_of
 from lidardesign.errors import check_number
+from lidardesign.fitting.request import FitRequest
 from lidardesign.mixture.bounds import INWARD, bounds_of
 from lidardesign.mixture.fit import FittedSensors
 from lidardesign.numerics import COARSE_SLACK
@@ -81,36 +82,28 @@ class ChosenRays(NamedTuple):
 
 
 def choose_rays(
+    request: FitRequest,
     training: TrainingScenes,
     samples: Samples,
     fitted: FittedSensors,
-    constraints: Constraints,
-    counts: Sequence[int],
     *,
-    level: float,
-    gates: str,
     pool: CandidatePool | None,
     certified: Sequence[int] = (),
     each_fires: bool = False,
     is_trial: bool = False,
-    most_patterns: int = 0,
     progress: Callable[[str], None] = lambda step: None,
 ) -> ChosenRays:
     """The rays of fitted sensors, one choice for each number of rays.
 
     Arguments:
+        request: What is asked for: numbers of rays, constraints, gates, and how many patterns follow what they see.
         training: Training scenes of the run.
         samples: Of the density, at all values of its condition.
         fitted: The sensors.
-        constraints: The constraints on sensors and rays.
-        counts: Numbers of rays, ascending; along a condition, at each of its values.
-        level: The share of each marginal that the sensors' intervals hold.
-        gates: "sensor" or "ray": one gate per sensor, or one per ray.
         pool: The pool of candidates at their place; None casts candidates anew.
         certified: The numbers of rays for which a bound is found.
         each_fires: Whether every sensor has to fire a ray.
-        is_trial: Whether the first few scenes are enough where candidates are cast anew.
-        most_patterns: The largest number of patterns that follow what they see; 0: none do.
+        is_trial: Whether the first few scenes are enough where candidates are cast anew, and one pattern.
         progress: Called with every step.
 
     Raises:
@@ -118,6 +111,7 @@ def choose_rays(
         DataError: No ray inside the sensors has information about the training scenes.
         InfeasibleError: A bandwidth in which no choice of so many rays fits.
     """
+    constraints, counts, level, gates = request.constraints, request.counts, request.level, request.gates
     check_number(counts[-1], "--rays", 1, MOST_SELECTED)
     budget, conditions = constraints.budget, training.run.conditions(samples.space)
     placed, may_fail = fitted.sensors, bool(constraints.survive)
@@ -156,7 +150,8 @@ def choose_rays(
         inform = cached_information if pool is None and training.keeps else inform_enough
         informed, held_back = inform(selection, training, counts[len(counts) // 2], progress)
     selected = select(selection, informed, held_back, counts, certified, progress)
-    adaptive = _adaptive(selection, selected[-1], training, most_patterns, progress) if most_patterns else None
+    is_adaptive = request.adaptive > 1 and not is_trial
+    adaptive = _adaptive(selection, selected[-1], training, request.adaptive, progress) if is_adaptive else None
     patterns = tuple(_pattern(one, conditions, samples) for one in selected)
     every = (*patterns, *(() if adaptive is None else adaptive.patterns))
     per_sensor = patterns[-1].per_sensor(len(placed))

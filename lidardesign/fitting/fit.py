@@ -317,18 +317,14 @@ class Fitter:
 
             middle = counts[len(counts) // 2]
             chosen = choose_rays(
+                request,
                 self.training,
                 self.samples,
                 fitted,
-                constraints,
-                counts,
-                level=request.level,
-                gates=request.gates,
                 pool=self.pool,
                 certified=() if is_trial or not certifies else counts if request.certify else (middle,),
                 each_fires=not may_idle,
                 is_trial=is_trial,
-                most_patterns=0 if is_trial or request.adaptive < 2 else request.adaptive,
                 progress=ignore if is_trial else self.progress,
             )
             design = replace(design, sensors=chosen.sensors, patterns=chosen.patterns, certificates=chosen.certificates)
