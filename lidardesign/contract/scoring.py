@@ -16,8 +16,8 @@ from lidardesign.contract.law import (
     shuffled,
     without_returns,
 )
-from lidardesign.numerics import SLACK
-from lidardesign.rays.information import checked_information, informs_rays
+from lidardesign.numerics import ROUNDING, SLACK
+from lidardesign.rays.information import checked_information, features_of, informs_rays
 from lidardesign.scenes.rays import Returns
 from lidardesign.scenes.scene import Scene
 from lidardesign.task import Information
@@ -175,11 +175,32 @@ def check_information(subject: Subject) -> LawHolds | NotApplicable:
         if one.shape != two.shape or not np.allclose(one, two, rtol=SLACK, atol=0):
             raise BrokenLawError(f"{said}: rays in another order are worth something else")
         pairs, rays = pairs + len(one), rays + len(order)
+        _check_features(subject, scene, first, other)
     if not rays:
         return NotApplicable("no candidate rays see a target under every condition")
     if not pairs:
         raise BrokenLawError(f"informs: {rays} rays at targets are worth nothing")
     return LawHolds(f"{rays} rays and their items are {pairs} pairs", {"pairs": pairs})
+
+
+def _check_features(subject: Subject, scene: Scene, first: list[Returns], other: list[Returns]) -> None:
+    """Features of a frame, where a task gives any, are as many in any order of rays, and none of them without returns.
+
+    Raises:
+        BrokenLawError: They are not.
+    """
+    features, said = features_of(subject.task), f"features in scene {scene.name!r}"
+    if features is None:
+        return
+    for one, reordered, silent in zip(first, other, without_returns(first), strict=True):
+        with subject.calling("features"):
+            found, again, nothing = (features(scene, returns) for returns in (one, reordered, silent))
+        if not (len(found) == len(again) == len(nothing)):
+            raise BrokenLawError(f"{said}: {len(found)}, {len(again)} and {len(nothing)} of them")
+        if not np.allclose(found, again, rtol=ROUNDING, atol=ROUNDING, equal_nan=True):
+            raise BrokenLawError(f"{said}: other numbers with rays in another order")
+        if np.isfinite(nothing).all():
+            raise BrokenLawError(f"{said}: numbers without a return", hint="not a number where nothing is known")
 
 
 def _pairs(found: Information, rays: np.ndarray) -> np.ndarray:

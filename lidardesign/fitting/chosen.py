@@ -192,10 +192,9 @@ def _adaptive(
     if found is None:
         return None
     patterns = []
-    for gate in found.gates:
-        rest = np.setdiff1d(np.flatnonzero(gate >= 0), found.look)
-        order = np.concatenate([found.look, rest[np.argsort(rays.sensor[rest], kind="stable")]])
-        fired = replace(rays.subset(order), gate_m=search.gate_m(gate)[order])
+    for number, gate in enumerate(found.gates):
+        rows = found.rows(number, rays.sensor)
+        fired = replace(rays.subset(rows), gate_m=search.gate_m(gate)[rows])
         patterns.append(Pattern.of(fired.as_angles()))
     return AdaptivePatterns(found.rule, tuple(patterns), found.shares)
 

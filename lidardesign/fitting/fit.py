@@ -351,7 +351,9 @@ class Fitter:
 
         metric, adaptive = self.request.run.metric, design.adaptive
         if adaptive is None:
-            notes.append("one pattern: training scenes are too few, or too much alike, for several")
+            notes.append(
+                "one pattern: training scenes are too few or too much alike for several, or bandwidth is too short"
+            )
             return design
         with phase("trials"):
             fixed = trial_of(self.request, design, len(adaptive))

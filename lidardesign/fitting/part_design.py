@@ -309,6 +309,9 @@ def _judge_sets(
         scenes.score(trials, number)
         left = (perf_counter() - began) * (few - number)
         progress(f"judging {len(trials)} sets of parts, about {left:.0f} s left")
+    if all(abs(one.scores.mean() - metric.worst) <= metric.tolerance for one in trials):
+        notes("none of the sets measures anything in these scenes: the best by the proxy is taken")
+        return [sets[0] for sets in by_number]
     found = [best_of(sets, scenes, metric, None, few, 2 * information.FEW_SCENES) for sets in by_number]
     for one, sets in zip(found, by_number, strict=True):
         text = f"{metric.name} [{metric.unit}] of {len(sets)} sets of {one.sensors} parts on training scenes"

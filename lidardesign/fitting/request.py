@@ -179,7 +179,7 @@ class FitRequest:
             fewest=None if options.numbers is None else options.numbers[0],
             goal=options.goal,
             least=options.least or ("bandwidth" if rules.parts is None else "parts"),
-            adaptive=_patterns(options, base, space, layout),
+            adaptive=_patterns(options, base, run, layout, rules),
         )
 
     @property
@@ -257,7 +257,9 @@ def _layout(constraints: Constraints, base: DesignSpec | None, run: RunFolder, o
     return "chosen" if informs_rays(run.task) and options.like is None else "even"
 
 
-def _patterns(options: FitOptions, base: DesignSpec | None, space: DesignSpace, layout: LayoutName) -> int:
+def _patterns(
+    options: FitOptions, base: DesignSpec | None, run: RunFolder, layout: LayoutName, rules: Constraints
+) -> int:
     """The user's largest number of patterns that follow what they see, else the design's; 1 for none.
 
     Raises:
@@ -265,10 +267,11 @@ def _patterns(options: FitOptions, base: DesignSpec | None, space: DesignSpace, 
     """
     most = options.adaptive
     if most is None:
-        most = 1 if base is None or base.adaptive is None or layout != "chosen" else len(base.adaptive.patterns) - 1
-    if most > 1 and space.conditioned:
-        names = " and ".join(DIMENSIONS[axis] for axis in space.conditioned)
-        raise ConfigError(f"rays follow {names} already", where="--adaptive", hint=f"give --at {names}=VALUE")
+        adaptive = None if base is None or layout != "chosen" or rules.survive or options.goal else base.adaptive
+        most = 1 if adaptive is None else len(adaptive.patterns) - 1
+    if most > 1 and run.config.space.conditioned:
+        names = " and ".join(DIMENSIONS[axis] for axis in run.config.space.conditioned)
+        raise ConfigError(f"rays follow {names} already", where="--adaptive", allowed="tasks without conditions")
     return most
 
 

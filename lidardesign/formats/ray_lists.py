@@ -258,22 +258,45 @@ def ray_columns(rays: Rays) -> dict[str, np.ndarray]:
     return dict(zip((*ORIGIN, *VECTOR, *RADIANS, START, END, SENSOR, TIME), columns, strict=True))
 
 
-def write_csv(_: DesignSpec, rays: Rays, path: Path) -> list[str]:
-    """Write one ray per row, every number with all its digits; returns notes of what the format cannot hold."""
-    columns = ray_columns(rays)
+def write_csv(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
+    """Write one ray per row, every number with all its digits; returns notes of what the format cannot hold.
+
+    Of patterns that follow what they see each row names its pattern, and the rule follows as comments.
+    """
+    columns, rule = pattern_columns(design, rays)
     rows = zip(*(column.tolist() for column in columns.values()), strict=True)
     lines = [",".join(columns), *(",".join(map(repr, row)) for row in rows)]
+    for name, values in rule.items():
+        for row in np.atleast_2d(values).tolist():
+            lines.append(f"# {name}: {','.join(map(repr, row))}")
     write_atomic(path, "\n".join(lines) + "\n")
     return list(LOST)
 
 
 def write_npz(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
-    """Write an array per column, and the sensors' names; returns notes of what the format cannot hold."""
+    """Write an array per column, the sensors' names, and the rule of patterns that follow what they see; returns notes
+    of what the format cannot hold."""
     buffer = io.BytesIO()
     names = np.array([sensor.name for sensor in design.sensors], dtype=np.str_)
-    np.savez(buffer, **ray_columns(rays), **{NAMES: names})
+    columns, rule = pattern_columns(design, rays)
+    np.savez(buffer, **columns, **rule, **{NAMES: names})
     write_atomic(path, buffer.getvalue())
     return list(LOST)
+
+
+def pattern_columns(design: DesignSpec, rays: Rays) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """The columns of a ray table, and the rule where the design's patterns follow what they see; else none.
+
+    These have a column `pattern`: 0 fires where nothing is known, the others near their centroid, row by row.
+    """
+    adaptive = design.following(len(rays))
+    if adaptive is None:
+        return ray_columns(rays), {}
+    rule, lists = adaptive.rule, [pattern.at() for pattern in adaptive.patterns]
+    columns = [ray_columns(replace(one, time_s=rays.time_s)) for one in lists]
+    joined = {name: np.concatenate([one[name] for one in columns]) for name in columns[0]}
+    joined["pattern"] = np.repeat(np.arange(len(lists)), len(rays))
+    return joined, {"looks": np.array(rule.looks), "missing_m": rule.missing_m, "centroids": rule.centroids}
 
 
 SENSOR_COLUMNS = (

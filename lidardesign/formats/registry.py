@@ -31,6 +31,7 @@ class Exporter:
         checked: How the tests check that this program reads the file.
         folder: Whether it writes a folder of files.
         rated: Whether it holds the frame rate, so that `write` takes `rate_hz` too.
+        following: Whether it holds patterns that follow what they see.
         robotic: Whether it can hold a robot's model with the sensors in it, so that `write` takes `robot` too.
     """
 
@@ -44,6 +45,7 @@ class Exporter:
     folder: bool = False
     rated: bool = False
     robotic: bool = False
+    following: bool = False
 
     def write(
         self,
@@ -68,6 +70,13 @@ class Exporter:
         """
         write = getattr(import_module(self.module), self.function)
         self.check_rate(rate_hz)
+        if len(rays) and design.following(len(rays)) is not None and not self.following:
+            raise ConfigError(
+                f"{self.name} cannot hold patterns that follow what they see",
+                where="--format",
+                allowed=f"with them {', '.join(name for name, exporter in EXPORTERS.items() if exporter.following)}",
+                hint="lidardesign constrain DESIGN --adaptive 1 makes the best single pattern",
+            )
         if robot is not None and not self.robotic:
             raise ConfigError(f"{self.name} cannot hold a robot", where="--robot", allowed="with mjcf")
         options: dict[str, Any] = {} if robot is None else {"robot": robot}
@@ -107,6 +116,7 @@ EXPORTERS: dict[str, Exporter] = {
             "write_csv",
             reader="anything that reads CSV; `evaluate` and `fit` too",
             checked="read by numpy",
+            following=True,
         ),
         Exporter(
             "npz",
@@ -116,6 +126,7 @@ EXPORTERS: dict[str, Exporter] = {
             "write_npz",
             reader="numpy",
             checked="read by numpy",
+            following=True,
         ),
         Exporter(
             "sensors-csv",

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidardesign.numerics import SLACK
+from lidardesign.numerics import SLACK, TINY
 from lidardesign.rays.choice import Choice, choose, choose_within
 from lidardesign.rays.information import checked_information, choosing
 from lidardesign.rays.selection import Selection
@@ -32,9 +32,10 @@ from lidardesign.task import Information, Task, random_generator
 # Frames that patterns are chosen on, and scenes that they are taken from at most; held back a quarter as many.
 WANTED_FRAMES, MOST_SCENES = 4000, 800
 HELD_BACK_SHARE = 0.25
-MOST_ITEMS = 100  # of a frame
-LOOKS = (12, 6, 3)  # of so many rays one looks first
+MOST_ITEMS, MOST_ITEMS_HELD_BACK = 60, 100  # of a frame
+LOOKS = (6, 3)  # of so many rays one looks first
 ROUNDS = 2  # in which frames change their pattern
+LEAST_PRICE = 0.01  # of all bandwidth, as a share of what rays know: where a single pattern has none
 PRICES, NEAR = 6, 0.97  # of bandwidth that are tried, until patterns take so much of what the single one does
 MISS_BEYOND_M = 0.15  # a miss counts as the median range of its ray and this much
 
@@ -77,7 +78,7 @@ def _value(informed: InformedScene, gate_m: np.ndarray) -> float:
 
 @phase("what returns tell")
 def frames_of(
-    task: Task, scenes: Sequence[Scene], rays: Rays, share: float, seed: int, features: Features | None
+    task: Task, scenes: Sequence[Scene], rays: Rays, share: float, seed: int, features: Features | None, most_items: int
 ) -> Frames:
     """Frames of scenes; the first of each has no frame before, whose features then are not a number."""
     informed, ranges, found = [], [], []
@@ -88,7 +89,7 @@ def frames_of(
         for frame, one in enumerate(returns):
             of_frame = InformedScene.of(_of_frame(information, frame), [one])
             generator = random_generator(seed, "items of frames", number, frame)
-            informed.append(of_frame.with_fewer_items(MOST_ITEMS, generator))
+            informed.append(of_frame.with_fewer_items(most_items, generator))
             if features is None:
                 ranges.append(one.range_m.astype(np.float32))
             else:
@@ -127,7 +128,7 @@ class ChosenPatterns:
 
     Arguments:
         rule: The rule.
-        look: Indices of the candidates that look first.
+        look: The gates of the candidates that look first, -1 for others, (N,).
         members: Numbers of the frames that each pattern but the first was chosen on.
         gates: The gate of each candidate in each pattern, -1 where it does not fire, (K + 1, N).
         shares: How often each fires on frames that were held back, (K + 1,).
@@ -140,6 +141,12 @@ class ChosenPatterns:
     gates: np.ndarray
     shares: np.ndarray
     value: float
+
+    def rows(self, pattern: int, sensor: np.ndarray) -> np.ndarray:
+        """The candidates of a pattern in their order: those that look first, then the others, by sensor (N,)."""
+        first = self.look >= 0
+        rest = np.flatnonzero((self.gates[pattern] >= 0) & ~first)
+        return np.concatenate([np.flatnonzero(first), rest[np.argsort(sensor[rest], kind="stable")]])
 
 
 class PatternSearch:
@@ -167,23 +174,21 @@ class PatternSearch:
         self.count, self.price = len(fixed.rays), fixed.price
 
     def best(self, most: int, progress: Callable[[str], None]) -> ChosenPatterns | None:
-        """The best patterns, at most `most` beside the one that fires where nothing is known; None where frames are
-        too few or too much alike."""
-        numbers = [number for number in _numbers(most) if number <= len(self.frames)]
-        if not numbers:
-            return None
-        progress(f"choosing {numbers[-1]} patterns")
+        """The best patterns, at most `most` beside the one that fires where nothing is known.
+
+        None where frames are too few or too much alike, or where no several patterns keep the bandwidth.
+        """
         has_looks = self.frames.features is None
-        looks = dict.fromkeys(max(self.count // part, 1) for part in LOOKS) if has_looks else (0,)
-        found = [self._divided(self._look(number), numbers[-1]) for number in looks]
-        found = [one for one in found if one is not None]
-        if not found:
-            return None
-        best = max(found, key=lambda one: one.value)
-        for number in numbers[:-1]:
+        counts = dict.fromkeys(max(self.count // part, 1) for part in LOOKS) if has_looks else (0,)
+        looks, best = [self._look(count) for count in counts], None
+        for number in reversed(_numbers(min(most, len(self.frames)))):
             progress(f"choosing {number} patterns")
-            found.append(self._divided(best.look, number))
-        best = max((one for one in found if one is not None), key=lambda one: one.value)
+            # the numbers of looking rays are compared at the largest number of patterns
+            found = [self._divided(look, number) for look in (looks if best is None else [best.look])]
+            # of equally good ones the fewest patterns
+            best = max([one for one in (*found, best) if one is not None], key=lambda one: one.value, default=None)
+        if best is None:
+            return None
         for _ in range(ROUNDS):
             best = max(best, self._reassigned(best), key=lambda one: one.value)
         return self._within(best)
@@ -197,13 +202,14 @@ class PatternSearch:
         bits = [self.selection.bandwidth.mbps_of_widths(np.diff(one)) for one in gates_m]
         return float(chosen.shares @ bits)
 
-    def _within(self, chosen: ChosenPatterns) -> ChosenPatterns:
-        """The patterns at the least price of bandwidth at which they take no more than the best single one."""
+    def _within(self, chosen: ChosenPatterns) -> ChosenPatterns | None:
+        """The patterns at the least price of bandwidth at which they take no more than the best single one; or None."""
         chosen = self._of(chosen.rule, chosen.look, chosen.members, passes=1)
         if np.isfinite(self.selection.limit_mbps):
-            return chosen
+            return chosen if ((chosen.gates >= 0).sum(axis=1) == self.count).all() else None
         low, high, best = 0.0, np.inf, None
         price = self.price
+        self.price = price or LEAST_PRICE * self.fixed.worth / max(self.fixed.bits, TINY)
         for _ in range(PRICES):
             if self._mbps(chosen) <= self.fixed.bits * (1 + SLACK):
                 best, high = chosen, self.price
@@ -214,12 +220,12 @@ class PatternSearch:
             self.price = 2 * low if np.isinf(high) else (low + high) / 2
             chosen = self._of(chosen.rule, chosen.look, chosen.members, passes=1)
         self.price = price
-        return best or chosen
+        return best
 
     def _look(self, looks: int) -> np.ndarray:
-        """The candidates that look first, by number: the best as if they were all."""
-        none = np.zeros(0, dtype=np.intp)
-        return np.flatnonzero(self._choose(self.frames.informed, none, looks) >= 0) if looks else none
+        """The gates of the candidates that look first, (N,): the best as if they were all."""
+        none = np.full(len(self.gates_m), -1)
+        return self._choose(self.frames.informed, none, looks) if looks else none
 
     def _rule(self, look: np.ndarray) -> tuple[PatternRule, np.ndarray]:
         """A rule without centroids, and the features of the frames, (U, F)."""
@@ -231,12 +237,13 @@ class PatternSearch:
         median = np.array(
             [np.median(one[own]) if own.any() else usual for one, own in zip(range_m.T, heard.T, strict=True)]
         )
-        rule = PatternRule(np.zeros((0, len(look))), len(look), median + MISS_BEYOND_M)
+        rule = PatternRule(np.zeros((0, len(median))), len(median), median + MISS_BEYOND_M)
         return rule, rule.ranges(range_m)
 
     def _seen_m(self, frames: Frames, look: np.ndarray) -> np.ndarray:
         """Ranges of the first look through its gates, not a number for misses, (U, looks) [m]."""
-        range_m, gate_m = frames.range_m[:, look].astype(np.float64), self.gates_m[look, 0]
+        rays = np.flatnonzero(look >= 0)
+        range_m, gate_m = frames.range_m[:, rays].astype(np.float64), self.gates_m[rays, look[rays]]
         return np.where((gate_m[:, 0] <= range_m) & (range_m < gate_m[:, 1]), range_m, np.nan)
 
     def _divided(self, look: np.ndarray, number: int) -> ChosenPatterns | None:
@@ -247,7 +254,7 @@ class PatternSearch:
         known = features[np.isfinite(features).all(axis=1)]
         if len(np.unique(known, axis=0)) < number:
             return None
-        generator = random_generator(self.seed, "patterns", number, len(look))
+        generator = random_generator(self.seed, "patterns", number, int((look >= 0).sum()))
         centroids, labels = kmeans2(known, number, minit="++", seed=generator, missing="warn")
         return self._fitted(rule, look, centroids[np.unique(labels)])
 
@@ -275,7 +282,7 @@ class PatternSearch:
     ) -> ChosenPatterns:
         """The patterns of a rule, each chosen on its frames, judged on frames that were held back."""
         informed = self.frames.informed
-        gates = [self._choose(informed, look, passes=passes) if len(look) else self.fixed.gate]
+        gates = [self._choose(informed, look, passes=passes) if (look >= 0).any() else self.fixed.gate]
         gates += [self._choose([informed[one] for one in own], look, passes=passes) for own in members]
         held_back = self.held_back
         features = held_back.features
@@ -292,17 +299,15 @@ class PatternSearch:
         """The gates of the best rays for some frames with the first look kept, (N,)."""
         selection = self.selection
         coverage = selection.coverage(informed, self.gates_m)
-        kept = np.full(coverage.shape[0], -1)
-        kept[look] = 0
         counts, share = selection.counts(count or self.count), (count or self.count) / self.count
         if np.isinf(selection.limit_mbps):
-            return choose(coverage, counts, price=self.price, passes=passes, kept=kept).gate
-        return choose_within(coverage, counts, share * selection.limit_mbps, passes=passes, kept=kept).gate
+            return choose(coverage, counts, price=self.price, passes=passes, kept=look).gate
+        return choose_within(coverage, counts, share * selection.limit_mbps, passes=passes, kept=look).gate
 
 
 def _numbers(most: int) -> list[int]:
-    """Numbers of patterns that are tried: powers of two from 2, and the largest."""
-    return sorted({*(2**power for power in range(1, most.bit_length())), most} - {1})
+    """Numbers of patterns that are tried, ascending: powers of two from 2, and the largest."""
+    return sorted({*(2**power for power in range(1, most.bit_length())), most} - {0, 1})
 
 
 def training_frames(
@@ -312,4 +317,5 @@ def training_frames(
     frames = training.first(purpose)[0].frames
     part = 1.0 if purpose == CHOICE else HELD_BACK_SHARE
     scenes = itertools.islice(training.scenes(purpose), round(part * min(-(-WANTED_FRAMES // frames), MOST_SCENES)))
-    return frames_of(training.run.task, list(scenes), rays, share, training.seed, features)
+    items = MOST_ITEMS if purpose == CHOICE else MOST_ITEMS_HELD_BACK
+    return frames_of(training.run.task, list(scenes), rays, share, training.seed, features, items)

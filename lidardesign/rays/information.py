@@ -82,9 +82,12 @@ def features_of(task: Task) -> Features | None:
 
 
 def _checked_features(task: Task, scene: Scene, returns: Returns) -> np.ndarray:
-    with plugin_guard(task.name):
-        found = task.features(scene, returns)
     where = f"task {task.name}, features, scene {scene.name}"
+    try:
+        with plugin_guard(task.name):
+            found = task.features(scene, returns)
+    except PluginError as error:
+        raise PluginError(f"features failed: {error.message}", where=where, hint=error.hint) from error
     try:
         features = np.asarray(found, dtype=np.float64)
     except (TypeError, ValueError):

@@ -100,6 +100,10 @@ class DesignSpec:
         """The pattern with `count` rays; None where it has none."""
         return next((pattern for pattern in self.patterns if len(pattern) == count), None)
 
+    def following(self, count: int) -> AdaptivePatterns | None:
+        """The patterns with `count` rays that follow what they see; None without."""
+        return self.adaptive if self.adaptive is not None and len(self.adaptive) == count else None
+
     def rays_per_sensor(self, count: int | None = None) -> np.ndarray | None:
         """Rays of each sensor, of `count` or of its own number, shape (S,); None where that is open."""
         count = self.count if count is None else count

@@ -27,7 +27,7 @@ from lidardesign.scoring.baselines.simple import Baselines, Option, TwinCandidat
 from lidardesign.scoring.baselines.views import TrainingObjective, TrainingViews
 from lidardesign.scoring.evaluation.request import EvaluationRequest, fired_numbers, numbers_fired
 from lidardesign.scoring.scene_scores import ONE_DEVICE, Devices, RaysPerCondition, score_scenes
-from lidardesign.sensors.adaptive import mean_mbps
+from lidardesign.sensors.adaptive import AdaptiveRays, mean_mbps
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design import DesignSpec, certificates_of
 from lidardesign.simulate.detector.physics import EFFECTS
@@ -113,7 +113,9 @@ def entries_of(request: EvaluationRequest) -> list[Entry]:
     ]
     shared = [count for count in counts if count not in request.alone]
     choosable = [] if request.training is None else greedy_rays(request.task, len(conditions), shared)[0]
-    starts = {one.rays: one.positions for one in designs if one.name == request.designs[0].name}
+    named = (request.designs[0].name, f"{request.designs[0].name}{SINGLE}") if request.designs else ()
+    single = [one for one in designs if not isinstance(one.positions, AdaptiveRays)]
+    starts = {one.rays: one.positions for one in single if one.name in named}
     # beside several designs a baseline has as many devices as the one with the most
     devices = max((Devices.of(one.positions) for one in designs), key=lambda one: one.number, default=ONE_DEVICE)
     baselines = Baselines(
@@ -196,10 +198,13 @@ def _of_design(
 ) -> list[Entry]:
     """The entry of a design; where its patterns follow what they see, with the best single one beside it."""
     fixed = Entry(design.name, _laid_out(request, conditions, design, count), baseline=False)
-    if design.adaptive is None or count != len(design.adaptive):
+    adaptive = design.following(count)
+    if adaptive is None:
         return [fixed]
-    following = request.following(design, design.adaptive)
-    return [replace(fixed, positions=following), replace(fixed, name=f"{design.name}{SINGLE}")]
+    return [
+        replace(fixed, positions=request.following(design, adaptive)),
+        replace(fixed, name=f"{design.name}{SINGLE}"),
+    ]
 
 
 def _laid_out(

@@ -162,6 +162,9 @@ class Wanderer:
             way = self._way(here, there, share)
             if self._free(way) and self._free(self._way(self.rest, there, np.linspace(0.0, 1.0, CHECKS))):
                 return way
+        # it came from rest without a collision, and can go back
+        if here is not self.rest and self._free(back := self._way(here, self.rest, share)):
+            return back
         raise DataError(
             f"{TRIES} random configurations collide", where=self.where, hint="motion=FILE.csv, or a model at rest "
             "with room to move"

@@ -1,0 +1,218 @@
+"""`fit --adaptive`: patterns that follow what they see in design files, in checks and in commands."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.command_line import make_run
+from support.strategies import patterns, sensors
+
+from lidardesign.api.run import open_run
+from lidardesign.constraints.check import check_design
+from lidardesign.errors import ConfigError
+from lidardesign.formats.designs import load_design
+from lidardesign.rays import adaptive
+from lidardesign.sensors.adaptive import AdaptivePatterns, PatternRule
+from lidardesign.sensors.design import DesignSpec
+from lidardesign.sensors.design_file import COLUMNS, design_document, design_from_document, save_design
+
+
+@st.composite
+def adaptive_designs(draw):
+    """A design of any figures with patterns that begin with the same look."""
+    rays, number = draw(st.integers(1, 5)), draw(st.integers(1, 3))
+    looks = draw(st.integers(0, rays))
+    generator = np.random.default_rng(draw(st.integers(0, 999)))
+    own = [draw(patterns(2, rays)) for _ in range(number + 1)]
+    for pattern in own[1:]:
+        for name in ("origin_m", "azimuth_rad", "elevation_rad", "gate_m"):
+            getattr(pattern, name)[:, :looks] = getattr(own[0], name)[:, :looks]
+        pattern.sensor[:looks] = own[0].sensor[:looks]
+    shares = generator.uniform(0, 1, number + 1)
+    rule = PatternRule(generator.normal(size=(number, looks or 2)), looks, generator.uniform(0, 9, looks))
+    return DesignSpec(
+        "seen",
+        tuple(draw(sensors(name, 0.5)) for name in ("a", "b")),
+        "chosen",
+        (draw(patterns(2, rays)),),
+        adaptive=AdaptivePatterns(rule, tuple(own), shares / shares.sum()),
+    )
+
+
+@given(design=adaptive_designs())
+def test_a_design_is_read_as_it_was_written_to_the_last_bit(tmp_path_factory, design):
+    path = tmp_path_factory.mktemp("design") / "seen.yaml"
+    save_design(design, path)
+    read = load_design(path)
+    assert design_document(read) == design_document(design)
+    found, made = read.adaptive, design.adaptive
+    assert found.rule.looks == made.rule.looks
+    for one, other in (
+        *((getattr(found.rule, name), getattr(made.rule, name)) for name in ("centroids", "missing_m")),
+        (found.shares, made.shares),
+        *(
+            (getattr(one, name), getattr(other, name))
+            for one, other in zip(found.patterns, made.patterns, strict=True)
+            for name in ("origin_m", "azimuth_rad", "elevation_rad", "gate_m", "sensor")
+        ),
+    ):
+        assert one.dtype == other.dtype
+        assert one.tobytes() == other.tobytes()
+        assert one.shape == other.shape
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(adaptive, "MOST_SCENES", 60)
+        yield
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return make_run(tmp_path_factory.mktemp("run") / "flat")
+
+
+@pytest.fixture(scope="module")
+def found(run):
+    """A design of two sensors with patterns that were kept."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("lidardesign.fitting.fit.Fitter._if_better", lambda self, design, notes: design)
+        fitted = open_run(run).fit(adaptive=2, rays=12, sensors=2, name="seen")
+    fitted.save()
+    return fitted.specification
+
+
+EDITS = {
+    "one centroid more": lambda rule: rule["centroids"].append(rule["centroids"][0]),
+    "no centroid": lambda rule: rule.update(centroids=[]),
+    "one pattern less": lambda rule: rule["patterns"].pop(),
+    "one share less": lambda rule: rule["shares"].pop(),
+    "shares that do not sum to 1": lambda rule: rule.update(shares=[0.5, 0.5, 0.5]),
+    "a share below 0": lambda rule: rule.update(shares=[-0.5, 1.0, 0.5]),
+    "longer looks than patterns": lambda rule: rule.update(
+        looks=13, missing_m=[1.0] * 13, centroids=[[1.0] * 13, [2.0] * 13]
+    ),
+    "looks without their ranges of misses": lambda rule: rule.update(missing_m=[]),
+    "centroids of other lengths": lambda rule: rule["centroids"][0].append(1.0),
+    "a centroid that is no number": lambda rule: rule["centroids"].__setitem__(0, [float("nan")]),
+    "a sensor that is missing": lambda rule: [pattern["sensor"].__setitem__(-1, 2) for pattern in rule["patterns"]],
+    "a key that nobody knows": lambda rule: rule.update(centroid=[[1.0]]),
+    **{
+        f"another {name} in the first look": lambda rule, name=name: rule["patterns"][1][name][0].__setitem__(
+            0, rule["patterns"][1][name][0][0] + 1e-6
+        )
+        for name in COLUMNS
+    },
+    "another sensor in the first look": lambda rule: rule["patterns"][1]["sensor"].__setitem__(
+        0, 1 - rule["patterns"][1]["sensor"][0]
+    ),
+}
+
+
+@pytest.mark.parametrize("edit", EDITS)
+def test_a_rule_that_was_edited_wrongly_is_refused(found, edit):
+    document = copy.deepcopy(design_document(found))
+    assert design_document(design_from_document(document)) == document
+    EDITS[edit](document["adaptive"])
+    with pytest.raises(ConfigError, match=r"adaptive|a pattern names a sensor"):
+        design_from_document(document, "seen", lambda path, **_: ".".join(map(str, path)) or "seen")
+
+
+def test_patterns_need_a_single_one_of_as_many_rays(found):
+    document = copy.deepcopy(design_document(found))
+    document["patterns"] = design_document(replace(found, patterns=(shorter(found.patterns[0]),)))["patterns"]
+    with pytest.raises(ConfigError, match="no pattern has as many rays as the adaptive ones"):
+        design_from_document(document)
+
+
+def shorter(pattern):
+    """A pattern without its last ray."""
+    columns = [getattr(pattern, name)[:, :-1] for name in ("origin_m", "azimuth_rad", "elevation_rad", "gate_m")]
+    return replace(pattern, **dict(zip(("origin_m", "azimuth_rad", "elevation_rad", "gate_m"), columns, strict=True)),
+                   sensor=pattern.sensor[:-1])  # fmt: skip
+
+
+RULES = {"gate": {"end_m": {"max": 1.5}}, "budget": {"rays": 12, "bandwidth_mbps": 0.5}}
+
+
+def broken(document, rules):
+    return {check.name for check in check_design(document, rules) if not check.satisfied}
+
+
+class TestTheChecker:
+    @pytest.mark.parametrize("number", [0, 1, 2])
+    def test_finds_what_any_pattern_breaks(self, found, number):
+        whole = design_document(found)
+        assert broken(whole, RULES) == set()
+        for column, value, names in (
+            ("gate_end_m", 1.6, {"ray3.gate.end_m.max"}),
+            ("gate_end_m", 40.0, {"ray3.gate.end_m.max", "budget.bandwidth_mbps"}),
+            ("azimuth_rad", 5.0, set()),
+        ):
+            document = copy.deepcopy(whole)
+            pattern = document["adaptive"]["patterns"][number]
+            pattern[column][0][3] = value
+            name = document["sensors"][pattern["sensor"][3]]["name"]
+            astray = f"{name}.rays.horizontal_rad" if column == "azimuth_rad" else f"{name}.rays.gate_m"
+            assert broken(document, RULES) == {*names, astray}
+
+    def test_counts_the_rays_of_every_pattern(self, found):
+        cut = tuple(map(shorter, found.adaptive.patterns))
+        document = design_document(replace(found, adaptive=replace(found.adaptive, patterns=cut)))
+        assert broken(document, {"budget": {"rays": 12}}) == {"budget.rays"}
+
+
+class TestAFit:
+    @pytest.mark.parametrize("rays", [8, 12])
+    def test_keeps_patterns_that_are_better_and_says_so_where_one_is(self, lidardesign, run, rays):
+        done = lidardesign("fit", run, "--adaptive", 2, "--rays", rays, "--sensors", 1, "--name", f"f{rays}", "-v")
+        assert done.code == 0, done.err
+        spec = open_run(run).fit(adaptive=2, rays=rays, sensors=1, name=f"f{rays}").specification
+        written = load_design(run / "designs" / f"f{rays}.yaml")
+        assert design_document(written)["patterns"] == design_document(spec)["patterns"]
+        assert (written.adaptive is None) == (spec.adaptive is None) == ("one pattern" in done.out + done.err)
+        assert spec.adaptive is None or {len(one) for one in spec.adaptive.patterns} == {rays}
+
+    def test_is_scored_beside_its_best_single_pattern(self, lidardesign, run, found):
+        options = ["--rays", 12, "--baseline", "uniform", "--set", "test=4", "--json"]
+        done = lidardesign("evaluate", run / "designs" / "seen.yaml", *options)
+        assert done.code == 0, done.err
+        rows = {row["design"]: row for row in done.json["rows"]}
+        assert list(rows)[:2] == ["seen", "seen-single"]
+        alone = replace(found, name="alone", adaptive=None)
+        save_design(alone, run / "designs" / "alone.yaml")
+        single = lidardesign("evaluate", run / "designs" / "alone.yaml", *options).json["rows"][0]
+        assert single["value"] == rows["seen-single"]["value"]
+        assert single["value"] != rows["seen"]["value"]
+
+    def test_of_one_pattern_is_a_fit_without_the_option(self, lidardesign, run):
+        written = []
+        for options in ([], ["--adaptive", 1]):
+            assert lidardesign("fit", run, "--rays", 9, "--sensors", 1, "--name", "one", *options).code == 0
+            written.append((run / "designs" / "one.yaml").read_bytes())
+        assert written[0] == written[1]
+
+    @pytest.mark.parametrize(
+        ("options", "words"),
+        [
+            (["--layout", "even"], "layout even"),
+            (["--layout", "spinning"], "layout spinning"),
+            (["--parts", "vl53l5cx"], "real parts"),
+            (["--sensors", "2", "--survive", "1"], "patterns that follow what they see"),
+            (["--goal", "20"], "a goal for patterns that follow what they see"),
+            (["--adaptive", "0"], "--adaptive: 0"),
+            (["--adaptive", "65"], "--adaptive: 65"),
+        ],
+    )
+    def test_refuses_what_patterns_cannot_follow(self, lidardesign, run, options, words):
+        done = lidardesign("fit", run, "--sensors", 1, "--adaptive", 2, "--name", "none", *options)
+        assert done.code == 2
+        assert "--adaptive" in done.err
+        assert words in done.err
+        assert not (run / "designs" / "none.yaml").exists()
