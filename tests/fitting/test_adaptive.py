@@ -5,43 +5,17 @@ from __future__ import annotations
 import copy
 from dataclasses import replace
 
-import numpy as np
 import pytest
 from hypothesis import given
-from hypothesis import strategies as st
 from support.command_line import make_run
-from support.strategies import patterns, sensors
+from support.strategies import adaptive_designs
 
 from lidardesign.api.run import open_run
 from lidardesign.constraints.check import check_design
 from lidardesign.errors import ConfigError
 from lidardesign.formats.designs import load_design
 from lidardesign.rays import adaptive
-from lidardesign.sensors.adaptive import AdaptivePatterns, PatternRule
-from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import COLUMNS, design_document, design_from_document, save_design
-
-
-@st.composite
-def adaptive_designs(draw):
-    """A design of any figures with patterns that begin with the same look."""
-    rays, number = draw(st.integers(1, 5)), draw(st.integers(1, 3))
-    looks = draw(st.integers(0, rays))
-    generator = np.random.default_rng(draw(st.integers(0, 999)))
-    own = [draw(patterns(2, rays)) for _ in range(number + 1)]
-    for pattern in own[1:]:
-        for name in ("origin_m", "azimuth_rad", "elevation_rad", "gate_m"):
-            getattr(pattern, name)[:, :looks] = getattr(own[0], name)[:, :looks]
-        pattern.sensor[:looks] = own[0].sensor[:looks]
-    shares = generator.uniform(0, 1, number + 1)
-    rule = PatternRule(generator.normal(size=(number, looks or 2)), looks, generator.uniform(0, 9, looks))
-    return DesignSpec(
-        "seen",
-        tuple(draw(sensors(name, 0.5)) for name in ("a", "b")),
-        "chosen",
-        (draw(patterns(2, rays)),),
-        adaptive=AdaptivePatterns(rule, tuple(own), shares / shares.sum()),
-    )
 
 
 @given(design=adaptive_designs())

@@ -7,6 +7,8 @@ import math
 import numpy as np
 from hypothesis import strategies as st
 
+from lidardesign.sensors.adaptive import AdaptivePatterns, PatternRule
+from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.pattern import TRAVELLED, Pattern
 from lidardesign.sensors.sensor import Sensor
 from lidardesign.space import DIMENSIONS
@@ -60,3 +62,25 @@ def patterns(draw, sensors=2, rays=None, dimension=None):
 
 
 conditions = st.sampled_from(TRAVELLED)
+
+
+@st.composite
+def adaptive_designs(draw):
+    """A design of any figures with patterns that begin with the same look."""
+    rays, number = draw(st.integers(1, 5)), draw(st.integers(1, 3))
+    looks = draw(st.integers(0, rays))
+    generator = np.random.default_rng(draw(st.integers(0, 999)))
+    own = [draw(patterns(2, rays)) for _ in range(number + 1)]
+    for pattern in own[1:]:
+        for name in ("origin_m", "azimuth_rad", "elevation_rad", "gate_m"):
+            getattr(pattern, name)[:, :looks] = getattr(own[0], name)[:, :looks]
+        pattern.sensor[:looks] = own[0].sensor[:looks]
+    shares = generator.uniform(0, 1, number + 1)
+    rule = PatternRule(generator.normal(size=(number, looks or 2)), looks, generator.uniform(0, 9, looks))
+    return DesignSpec(
+        "seen",
+        tuple(draw(sensors(name, 0.5)) for name in ("a", "b")),
+        "chosen",
+        (draw(patterns(2, rays)),),
+        adaptive=AdaptivePatterns(rule, tuple(own), shares / shares.sum()),
+    )

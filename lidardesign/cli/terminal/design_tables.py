@@ -73,6 +73,8 @@ def _show_certificates(design: DesignSpec, rich: RichConsole) -> None:
     ]
     if rows:
         rich.print(text_table(columns, rows, "\nrays chosen on training scenes", columns))
+    if design.adaptive is not None:
+        rich.print(f"{len(design.adaptive.patterns)} patterns of {len(design.adaptive)} rays follow what they see")
 
 
 def _rays_of(design: DesignSpec) -> list[int | None]:

@@ -147,28 +147,35 @@ class Wanderer:
         time_s = np.arange(frames) / rate_hz
         moves = max(1, math.ceil(time_s[-1] / MOVE_S))
         share = np.clip(time_s[None] / MOVE_S - np.arange(moves)[:, None], 0.0, 1.0)
-        here = self._next(self.rest, np.ones(1), generator)[-1]
+        first = self._next(self.rest, np.ones(1), generator)
+        here, stuck = (self.rest, 1) if first is None else (first[-1], 0)
         found = np.tile(here, (frames, 1))
         for move in range(moves):
             now = (time_s >= move * MOVE_S) & ((time_s < (move + 1) * MOVE_S) | (move == moves - 1))
-            way = self._next(here, np.append(share[move, now], 1.0), generator)
+            shares = np.append(share[move, now], 1.0)
+            way = self._next(here, shares, generator)
+            if way is None:
+                # it came from rest without a collision, and can go back
+                way, stuck = self._way(here, self.rest, shares), stuck + 1
             found[now], here = way[:-1], way[-1]
+        if stuck > moves:
+            raise DataError(
+                f"{stuck * TRIES} random configurations collide", where=self.where, hint="motion=FILE.csv, or a model "
+                "at rest with room to move"
+            )  # fmt: skip
         return found
 
-    def _next(self, here: np.ndarray, share: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-        """Path to a random configuration without collisions at shares of its time, reachable from rest without any."""
+    def _next(self, here: np.ndarray, share: np.ndarray, generator: np.random.Generator) -> np.ndarray | None:
+        """Path to a random configuration without collisions at shares of its time, reachable from rest without any.
+
+        None where none of `TRIES` is free.
+        """
         for attempt in range(TRIES):
             there = self._configuration(NEARER**attempt, generator)
             way = self._way(here, there, share)
             if self._free(way) and self._free(self._way(self.rest, there, np.linspace(0.0, 1.0, CHECKS))):
                 return way
-        # it came from rest without a collision, and can go back
-        if here is not self.rest and self._free(back := self._way(here, self.rest, share)):
-            return back
-        raise DataError(
-            f"{TRIES} random configurations collide", where=self.where, hint="motion=FILE.csv, or a model at rest "
-            "with room to move"
-        )  # fmt: skip
+        return None
 
     def _configuration(self, reach: float, generator: np.random.Generator) -> np.ndarray:
         """Random joints within a share of their limits around rest; free bodies and unlimited slides rest."""
