@@ -25,13 +25,13 @@ DETECTORS |= {"100 klux": ("--detector", "single-photon", "--set", "illuminance_
 
 @dataclass(frozen=True)
 class Case:
-    """What is designed for: task, settings, numbers of rays, words of `fit`, and whether detectors are tried."""
+    """What is designed for: task, settings, numbers of rays, words of `fit`, and scenes that detectors are tried in."""
 
     task: str
     settings: tuple[str, ...]
     rays: tuple[int, ...]
     words: tuple[str, ...] = ("--sensors", "4", "--adaptive", "8")
-    with_detectors: bool = False
+    lit_scenes: int = 0
 
 
 def cases() -> dict[str, Case]:
@@ -39,10 +39,10 @@ def cases() -> dict[str, Case]:
     fine = ("--sensors", "4", "--gates", "ray", "--adaptive", "8")
     model = tuple(f"{key}={value}" for key, value in face_settings("ict").items())
     found = {
-        "faces": Case("face", (), (361,), fine, with_detectors=True),
+        "faces": Case("face", (), (361,), fine, lit_scenes=100),
         "faces, a gate per sensor": Case("face", (), (196,)),
         "heads held less still": Case("face", ("jitter_translation_m=0.03", "jitter_rotation_deg=12"), (361,), fine),
-        "arm": Case("arm", (), (100, 400), ("--sensors", "4", "--adaptive", "16"), with_detectors=True),
+        "arm": Case("arm", (), (100, 400), ("--sensors", "4", "--adaptive", "16"), lit_scenes=20),
         "head model": Case("face", model, (361,), fine),
     }
     humanoid = humanoid_settings()
@@ -70,11 +70,13 @@ def measured(title: str, options: Any) -> list[dict[str, Any]]:
             words = [word for key in case.settings for word in ("--set", key)]
             document("learn", case.task, "--preset", "draft", "--seed", str(seed), "--out", run, *words)
         for rays in case.rays:
-            document("fit", run, *case.words, "--rays", str(rays), "--name", f"a{rays}")
+            if not (run / "designs" / f"a{rays}.yaml").exists():
+                document("fit", run, *case.words, "--rays", str(rays), "--name", f"a{rays}")
     for rays in case.rays:
-        for light, words in DETECTORS.items() if case.with_detectors else [("ideal", ())]:
+        for light, words in DETECTORS.items() if case.lit_scenes else [("ideal", ())]:
+            scenes = 100 if light == "ideal" else case.lit_scenes
             which = ("--designs", f"a{rays}", "--rays", str(rays), "--scenes-seed", HELD_OUT_SEED)
-            scores = document("evaluate", *runs, *which, "--set", "test=100", "--baseline", "none", *words)
+            scores = document("evaluate", *runs, *which, "--set", f"test={scenes}", "--baseline", "none", *words)
             found.append({"rays": rays, "light": light, **scores})
     kept.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     return found

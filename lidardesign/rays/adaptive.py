@@ -14,11 +14,13 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from lidardesign.numerics import SLACK, TINY
 from lidardesign.rays.choice import Choice, choose, choose_within
+from lidardesign.rays.coverage import Coverage
 from lidardesign.rays.information import checked_information, choosing
 from lidardesign.rays.selection import Selection
 from lidardesign.rays.training import CHOICE, InformedScene, TrainingScenes
@@ -204,7 +206,8 @@ class PatternSearch:
 
     def _within(self, chosen: ChosenPatterns) -> ChosenPatterns | None:
         """The patterns at the least price of bandwidth at which they take no more than the best single one; or None."""
-        chosen = self._of(chosen.rule, chosen.look, chosen.members, passes=1)
+        tables = self._tables(chosen.members)
+        chosen = self._of(chosen.rule, chosen.look, chosen.members, tables, passes=1)
         if np.isfinite(self.selection.limit_mbps):
             return chosen if ((chosen.gates >= 0).sum(axis=1) == self.count).all() else None
         low, high, best = 0.0, np.inf, None
@@ -218,14 +221,24 @@ class PatternSearch:
             if best is not None and self._mbps(best) >= NEAR * self.fixed.bits:
                 break
             self.price = 2 * low if np.isinf(high) else (low + high) / 2
-            chosen = self._of(chosen.rule, chosen.look, chosen.members, passes=1)
+            chosen = self._of(chosen.rule, chosen.look, chosen.members, tables, passes=1)
         self.price = price
         return best
 
     def _look(self, looks: int) -> np.ndarray:
         """The gates of the candidates that look first, (N,): the best as if they were all."""
         none = np.full(len(self.gates_m), -1)
-        return self._choose(self.frames.informed, none, looks) if looks else none
+        return self._choose(self._whole, none, looks) if looks else none
+
+    @cached_property
+    def _whole(self) -> Coverage:
+        """Information of the candidates about all frames."""
+        return self.selection.coverage(self.frames.informed, self.gates_m)
+
+    def _tables(self, members: Sequence[np.ndarray]) -> list[Coverage]:
+        """Information of the candidates about the frames of each pattern."""
+        informed = self.frames.informed
+        return [self.selection.coverage([informed[one] for one in own], self.gates_m) for own in members]
 
     def _rule(self, look: np.ndarray) -> tuple[PatternRule, np.ndarray]:
         """A rule without centroids, and the features of the frames, (U, F)."""
@@ -275,15 +288,19 @@ class PatternSearch:
         picked = rule.patterns_of(features)
         present = np.setdiff1d(picked, [UNKNOWN])
         members = [np.flatnonzero(picked == one) for one in present]
-        return self._of(replace(rule, centroids=centroids[present - 1]), look, members)
+        return self._of(replace(rule, centroids=centroids[present - 1]), look, members, self._tables(members))
 
     def _of(
-        self, rule: PatternRule, look: np.ndarray, members: Sequence[np.ndarray], passes: int = 0
+        self,
+        rule: PatternRule,
+        look: np.ndarray,
+        members: Sequence[np.ndarray],
+        tables: Sequence[Coverage],
+        passes: int = 0,
     ) -> ChosenPatterns:
         """The patterns of a rule, each chosen on its frames, judged on frames that were held back."""
-        informed = self.frames.informed
-        gates = [self._choose(informed, look, passes=passes) if (look >= 0).any() else self.fixed.gate]
-        gates += [self._choose([informed[one] for one in own], look, passes=passes) for own in members]
+        gates = [self._choose(self._whole, look, passes=passes) if (look >= 0).any() else self.fixed.gate]
+        gates += [self._choose(table, look, passes=passes) for table in tables]
         held_back = self.held_back
         features = held_back.features
         picked = rule.patterns_of(rule.ranges(self._seen_m(held_back, look)) if features is None else features)
@@ -293,12 +310,9 @@ class PatternSearch:
         return ChosenPatterns(rule, look, members, np.array(gates), shares, value)
 
     @phase("choice")
-    def _choose(
-        self, informed: Sequence[InformedScene], look: np.ndarray, count: int | None = None, passes: int = 0
-    ) -> np.ndarray:
+    def _choose(self, coverage: Coverage, look: np.ndarray, count: int | None = None, passes: int = 0) -> np.ndarray:
         """The gates of the best rays for some frames with the first look kept, (N,)."""
         selection = self.selection
-        coverage = selection.coverage(informed, self.gates_m)
         counts, share = selection.counts(count or self.count), (count or self.count) / self.count
         if np.isinf(selection.limit_mbps):
             return choose(coverage, counts, price=self.price, passes=passes, kept=look).gate
