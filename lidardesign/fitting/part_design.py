@@ -52,6 +52,7 @@ from lidardesign.space import angles, observed_point
 from lidardesign.task import Information, Metric, random_generator
 
 MOST_JUDGED = 8  # sets of a number of parts, by the task's score; twice as many under a detector
+JUDGED_FRAMES = 2000  # that the last sets are scored in at most, or twice as many scenes as at first
 MOST_POSES = 500  # of each kind of part, over all places
 MOST_PLACES = 25  # in a box of origins
 MOST_TOLD = 1_000_000  # candidates times scenes
@@ -312,7 +313,8 @@ def _judge_sets(
     if all(abs(one.scores.mean() - metric.worst) <= metric.tolerance for one in trials):
         notes("none of the sets measures anything in these scenes: the best by the proxy is taken")
         return [sets[0] for sets in by_number]
-    found = [best_of(sets, scenes, metric, None, few, 2 * information.FEW_SCENES) for sets in by_number]
+    most = min(max(JUDGED_FRAMES // scenes.scenes[0].frames, 2 * information.FEW_SCENES), information.MOST_SCENES)
+    found = [best_of(sets, scenes, metric, None, few, most) for sets in by_number]
     for one, sets in zip(found, by_number, strict=True):
         text = f"{metric.name} [{metric.unit}] of {len(sets)} sets of {one.sensors} parts on training scenes"
         values = ", ".join(f"{each.scores[:few].mean():.4g}" for each in sets)
