@@ -32,7 +32,7 @@ from lidardesign.simulate.returns import simulate_many
 from lidardesign.task import Information, Task, random_generator
 
 # Frames that patterns are chosen on, and scenes that they are taken from at most; held back a quarter as many.
-WANTED_FRAMES, MOST_SCENES = 4000, 800
+WANTED_FRAMES, MOST_SCENES = 16_000, 800
 HELD_BACK_SHARE = 0.25
 MOST_ITEMS, MOST_ITEMS_HELD_BACK = 60, 100  # of a frame
 LOOKS = (6, 3)  # of so many rays one looks first
