@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -23,6 +23,7 @@ from lidardesign.scenes.surface import grid_faces, round_triangles
 from lidardesign.scoring.evaluation.entries import ordered_conditions
 from lidardesign.scoring.evaluation.request import EvaluationRequest, numbers_fired
 from lidardesign.scoring.evaluation.results import Evaluation
+from lidardesign.sensors.adaptive import AdaptiveRays
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import design_document
 from lidardesign.sensors.pattern import field_on_sphere
@@ -44,6 +45,7 @@ FEWEST_STEPS = 4  # where a scene has very many of them
 SHELL_STEPS = 8  # along each side of a gate's shell
 SMALLEST_SPREAD_M = 1e-3  # of origins; less looks like one place
 PLANE_MARGIN = 0.1  # of the scene's extent, beyond which an infinite plane is not drawn
+PATTERN = "pattern"  # in place of a condition, where patterns follow what they see
 Conditions = Mapping[str, float]
 
 
@@ -86,6 +88,7 @@ class SceneFigure:
         designs: The designs, with their rays there.
         physics: Whether outcomes include a detector's effects, or are of geometry alone.
         all_places: Number of all condition values.
+        fired: The pattern that fires in each frame, by the name of a design whose patterns follow what they see.
     """
 
     scene: Scene
@@ -94,6 +97,7 @@ class SceneFigure:
     designs: tuple[DrawnDesign, ...]
     physics: bool = False
     all_places: int = 1
+    fired: Mapping[str, Sequence[int]] = field(default_factory=dict)
 
     @cached_property
     def directions(self) -> np.ndarray:
@@ -131,7 +135,8 @@ def scene_figure(
     drawn = []
     for design, rays, (length_m, outcome) in zip(designs, every, outcomes, strict=True):
         keep = np.array(_spread(len(rays[0]), budget), dtype=np.int64)
-        at, some = tuple(design.at_condition(where) for where in chosen), tuple(one.subset(keep) for one in rays)
+        at = tuple(design if PATTERN in where else design.at_condition(where) for where in chosen)
+        some = tuple(one.subset(keep) for one in rays)
         drawn.append(DrawnDesign(design, at, some, length_m[..., keep], outcome[..., keep], len(rays[0])))
     return SceneFigure(scene, frames, chosen, tuple(drawn), planner is not None, len(places))
 
@@ -179,13 +184,32 @@ def _first_hits(rays: Sequence[Rays], casters: Sequence[SceneCaster]) -> tuple[n
 def evaluated_scene(evaluation: Evaluation, request: EvaluationRequest) -> SceneFigure:
     """An evaluation's designs in its first held-out scene, with the effects that the scenes call for."""
 
-    def laid_out(design: DesignSpec, at: Conditions) -> Rays:
-        count = design.count or max(numbers_fired(design, request.rays, request.alone))
-        return request.fired(design, count, at)
+    def number(design: DesignSpec) -> int:
+        return design.count or max(numbers_fired(design, request.rays, request.alone))
 
+    def laid_out(design: DesignSpec, at: Conditions) -> Rays:
+        lists = following.get(design.name)
+        if lists is not None:
+            return lists[min(int(at[PATTERN]), len(lists) - 1)]
+        return request.fired(design, number(design), {} if PATTERN in at else at)
+
+    own = {design.name: (design, design.following(number(design))) for design in request.designs}
+    following = {name: request.following(*one) for name, one in own.items() if one[1] is not None}
     planner = request.planner if any(effect.on for effect in evaluation.effects) else None
-    places = ordered_conditions(request)
-    return scene_figure(request.test[0], request.designs, places, laid_out, planner=planner, seed=request.seed)
+    places: Sequence[Conditions] = ordered_conditions(request)
+    if following:
+        places = [{PATTERN: pattern} for pattern in range(max(map(len, following.values())))]
+    scene = request.test[0]
+    found = scene_figure(scene, request.designs, places, laid_out, planner=planner, seed=request.seed)
+    return replace(found, fired={name: _fired(scene, one, planner, request.seed) for name, one in following.items()})
+
+
+def _fired(scene: Scene, positions: AdaptiveRays, planner: Planner | None, seed: int) -> list[int]:
+    """The pattern that fires in each frame of a scene."""
+    casters = build_casters(scene)
+    physics = None if planner is None else planner.physics(planner.plan(scene, list(positions), casters), seed)
+    returns = simulate_many(scene, positions, casters=casters, physics=physics, repeats=[0] * len(positions))
+    return positions.fired(scene, returns)
 
 
 def constraint_slack_of(design: DesignSpec, space: DesignSpace) -> list[ConstraintSlack]:

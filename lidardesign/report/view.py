@@ -21,6 +21,7 @@ from lidardesign.numerics import EPSILON_FLOAT32
 from lidardesign.report.markup import embedded, swatch, switch
 from lidardesign.report.scene_figure import (
     MOST_FACES,
+    PATTERN,
     SMALLEST_SPREAD_M,
     DrawnDesign,
     SceneFigure,
@@ -33,12 +34,13 @@ from lidardesign.report.scene_figure import (
 )
 from lidardesign.report.series import OUTCOME_WORDS, Series
 from lidardesign.scenes.rays import Outcome
-from lidardesign.scenes.scene import Body
+from lidardesign.scenes.scene import Body, Scene
 from lidardesign.sensors.pattern import field_on_sphere
 from lidardesign.sensors.sensor import Sensor, interval_factor
 
 MOST_SENSORS = 40  # drawn as frusta and switched one by one; of more only rays are drawn
 MOST_BODIES = 2000  # of a scene, the largest first
+MOST_RUNS = 20  # of patterns that fire one after the other
 MARGIN = 1.0  # of the scene's extent: rays that go farther are cut there
 BESIDE_DEG, ABOVE_DEG = 129.0, 26.0  # of the first view: from where sensors look, and above the ground
 # More rays that hit nothing would hide everything else.
@@ -271,7 +273,8 @@ def view_notes(shown: SceneFigure) -> list[str]:
     if len(shown.frames) < shown.scene.frames:
         left_out.append(f"{len(shown.frames)} of {shown.scene.frames} frames are shown")
     if len(shown.places) < shown.all_places:
-        left_out.append(f"{len(shown.places)} of {shown.all_places} positions are shown")
+        left_out.append(f"{len(shown.places)} of {shown.all_places} patterns or positions are shown")
+    left_out += [f"{name} fires {_runs(patterns, shown.scene)}" for name, patterns in shown.fired.items()]
     for one in shown.designs:
         if len(one.rays[0]) < one.fired:
             left_out.append(f"{len(one.rays[0])} of {one.fired} rays of {one.design.name} are drawn")
@@ -281,13 +284,23 @@ def view_notes(shown: SceneFigure) -> list[str]:
     return [how, *([further[0].upper() + further[1:] + "."] if further else [])]
 
 
+def _runs(patterns: Sequence[int], scene: Scene) -> str:
+    """The patterns that fire one after the other, with the times at which they begin."""
+    begins = [frame for frame, one in enumerate(patterns) if not frame or one != patterns[frame - 1]]
+    if len(begins) == 1:
+        return f"pattern {patterns[0]} here"
+    shown = ", ".join(f"{patterns[frame]} from {frame / scene.frame_rate_hz:.4g} s" for frame in begins[:MOST_RUNS])
+    return f"patterns {shown}{', ...' if len(begins) > MOST_RUNS else ''}"
+
+
 def _sliders(shown: SceneFigure) -> str:
     names = " and ".join(shown.places[0]) or "position"
+    along = "Pattern" if names == PATTERN else f"Position: {names}"
     places = [", ".join(f"{name} = {value:.4g}" for name, value in place.items()) for place in shown.places]
     rate_hz, count = shown.scene.frame_rate_hz, shown.scene.frames
     frames = [f"frame {frame + 1} of {count}, {frame / rate_hz:.2f} s" for frame in shown.frames]
     sliders = ""
-    for step, title, labels in (("place", f"Position: {names}", places), ("frame", "Time", frames)):
+    for step, title, labels in (("place", along, places), ("frame", "Time", frames)):
         if len(labels) > 1:
             sliders += (
                 f'<div class="slider"><label for="view-{step}">{html.escape(title)}</label>'

@@ -118,6 +118,10 @@ class AdaptiveRays(tuple[Rays, ...]):
         """Its parts, for workers."""
         return tuple(self), self.rule, self.shares, self.features
 
+    def mapped(self, change: Callable[[Rays], Rays]) -> AdaptiveRays:
+        """The same after a change of the rays of each pattern."""
+        return AdaptiveRays(map(change, self), self.rule, self.shares, self.features)
+
     def fired(self, scene: Scene, returns: Sequence[Sequence[Returns]]) -> list[int]:
         """The pattern that fires in each frame.
 
@@ -142,9 +146,7 @@ class AdaptiveRays(tuple[Rays, ...]):
 
 def mapped(positions: tuple[Rays, ...], change: Callable[[Rays], Rays]) -> tuple[Rays, ...]:
     """Rays at condition values, or of patterns, after a change of each."""
-    if isinstance(positions, AdaptiveRays):
-        return AdaptiveRays(map(change, positions), positions.rule, positions.shares, positions.features)
-    return tuple(map(change, positions))
+    return positions.mapped(change) if isinstance(positions, AdaptiveRays) else tuple(map(change, positions))
 
 
 def mean_mbps(positions: Sequence[Rays], bandwidth: Bandwidth) -> float:

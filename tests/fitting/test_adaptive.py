@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import re
 from dataclasses import replace
 
 import pytest
@@ -164,6 +165,26 @@ class TestAFit:
         single = lidardesign("evaluate", run / "designs" / "alone.yaml", *options).json["rows"][0]
         assert single["value"] == rows["seen-single"]["value"]
         assert single["value"] != rows["seen"]["value"]
+
+    def test_has_a_report_that_says_which_pattern_fires_and_goes_through_all(self, lidardesign, run, found, tmp_path):
+        page = tmp_path / "report.html"
+        options = ["--rays", 12, "--baseline", "none", "--set", "test=2", "--report", page]
+        assert lidardesign("evaluate", run / "designs" / "seen.yaml", *options).code == 0
+        text = page.read_text(encoding="utf-8")
+        assert re.search(r"[Ss]een fires pattern [0-9] here", text)
+        assert 'label for="view-place">Pattern<' in text
+        assert f"pattern = {len(found.adaptive.patterns) - 1}" in text
+
+    def test_starts_a_search_for_a_baseline_from_the_single_pattern(self, lidardesign, run, found):
+        options = ["--rays", 12, "--baseline", "cma", "--cma-seconds", 1, "--set", "test=2", "--json"]
+        done = lidardesign("evaluate", run / "designs" / "seen.yaml", *options)
+        assert [row["rays"] for row in done.json["rows"] if row["design"] == "cma"] == [12]
+
+    def test_is_a_single_pattern_where_constraints_ask_for_what_none_can_follow(self, lidardesign, run, found):
+        options = ["--survive", 1, "--sensors", 2, "--rays", 12, "--name", "survives"]
+        done = lidardesign("constrain", run / "designs" / "seen.yaml", *options)
+        assert done.code == 0, done.err
+        assert load_design(run / "designs" / "survives.yaml").adaptive is None
 
     def test_of_one_pattern_is_a_fit_without_the_option(self, lidardesign, run):
         written = []

@@ -113,9 +113,10 @@ def entries_of(request: EvaluationRequest) -> list[Entry]:
     ]
     shared = [count for count in counts if count not in request.alone]
     choosable = [] if request.training is None else greedy_rays(request.task, len(conditions), shared)[0]
+    # a search starts from single patterns of the first design
     named = (request.designs[0].name, f"{request.designs[0].name}{SINGLE}") if request.designs else ()
-    single = [one for one in designs if not isinstance(one.positions, AdaptiveRays)]
-    starts = {one.rays: one.positions for one in single if one.name in named}
+    searched = [one for one in designs if one.name in named and not isinstance(one.positions, AdaptiveRays)]
+    starts = {one.rays: one.positions for one in searched}
     # beside several designs a baseline has as many devices as the one with the most
     devices = max((Devices.of(one.positions) for one in designs), key=lambda one: one.number, default=ONE_DEVICE)
     baselines = Baselines(
@@ -142,7 +143,7 @@ def entries_of(request: EvaluationRequest) -> list[Entry]:
             for entry in designs
             if entry.rays in shared
             for name in request.baselines
-            if name != cma.CMA or entry.name == request.designs[0].name
+            if name != cma.CMA or entry in searched
             if name != GREEDY or entry.rays in choosable
         ]
     wanted = [one for one in wanted if one[1]]

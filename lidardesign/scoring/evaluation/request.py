@@ -23,7 +23,7 @@ from lidardesign.scoring.baselines.cma import CmaSettings
 from lidardesign.scoring.baselines.simple import ALWAYS, BASELINES, check_baseline
 from lidardesign.scoring.evaluation.mounting import MountError
 from lidardesign.scoring.scene_scores import RaysPerCondition, ScenePass
-from lidardesign.sensors.adaptive import AdaptivePatterns, mapped
+from lidardesign.sensors.adaptive import AdaptivePatterns, AdaptiveRays
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.simulate.calibration import with_part_light
@@ -136,10 +136,10 @@ class EvaluationRequest:
         """The rays of a design at condition values, with the light that the detector has in its parts."""
         return with_part_light(design.rays(count, at=at or None), design, self.planner.detector)
 
-    def following(self, design: DesignSpec, adaptive: AdaptivePatterns) -> RaysPerCondition:
+    def following(self, design: DesignSpec, adaptive: AdaptivePatterns) -> AdaptiveRays:
         """The rays of a design's patterns that follow what they see, with the detector's light."""
         rays = adaptive.rays(features_of(self.task))
-        return mapped(rays, lambda one: with_part_light(one, design, self.planner.detector))
+        return rays.mapped(lambda one: with_part_light(one, design, self.planner.detector))
 
     def scene_pass(
         self, fired: Callable[[int], Sequence[RaysPerCondition]], planner: Planner, plans: Sequence[EffectPlan] = ()
