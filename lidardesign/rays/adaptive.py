@@ -12,9 +12,10 @@ References:
 from __future__ import annotations
 
 import itertools
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -78,32 +79,31 @@ def _value(informed: InformedScene, gate_m: np.ndarray) -> float:
     return float(informed.weight @ known - informed.harm[spoils].sum())
 
 
-@phase("what returns tell")
-def frames_of(
-    task: Task, scenes: Sequence[Scene], rays: Rays, share: float, seed: int, features: Features | None, most_items: int
+def frames_of_scene(
+    task: Task,
+    rays: Rays,
+    share: float,
+    seed: int,
+    features: Features | None,
+    most_items: int,
+    scene: Scene,
+    number: int,
 ) -> Frames:
-    """Frames of scenes; the first of each has no frame before, whose features then are not a number."""
-    informed, ranges, found = [], [], []
-    for number, scene in enumerate(scenes):
-        with choosing(share):
-            returns = simulate_many(scene, [rays])[0]
-            information = checked_information(task, scene, returns)
-        for frame, one in enumerate(returns):
-            of_frame = InformedScene.of(_of_frame(information, frame), [one])
-            generator = random_generator(seed, "items of frames", number, frame)
-            informed.append(of_frame.with_fewer_items(most_items, generator))
-            if features is None:
-                ranges.append(one.range_m.astype(np.float32))
-            else:
-                found.append(features(scene, one))
-        if features is not None:
-            nothing = np.full_like(found[-1], np.nan)
-            found[-len(returns) :] = [nothing, *found[-len(returns) : -1]]
-    return Frames(
-        informed,
-        np.array(ranges) if ranges else np.zeros((len(informed), 0), np.float32),
-        None if features is None else np.array(found, dtype=np.float64),
-    )
+    """The frames of a scene; the first has no frame before, whose features then are not a number."""
+    with choosing(share):
+        returns = simulate_many(scene, [rays])[0]
+        information = checked_information(task, scene, returns)
+    informed = [
+        InformedScene.of(_of_frame(information, frame), [one]).with_fewer_items(
+            most_items, random_generator(seed, "items of frames", number, frame)
+        )
+        for frame, one in enumerate(returns)
+    ]
+    if features is None:
+        return Frames(informed, np.array([one.range_m for one in returns], dtype=np.float32), None)
+    seen = np.array([features(scene, one) for one in returns])
+    before = np.concatenate([np.full_like(seen[:1], np.nan), seen[:-1]])
+    return Frames(informed, np.zeros((len(informed), 0), dtype=np.float32), before)
 
 
 def _of_frame(information: Information, frame: int) -> Information:
@@ -268,7 +268,9 @@ class PatternSearch:
         if len(np.unique(known, axis=0)) < number:
             return None
         generator = random_generator(self.seed, "patterns", number, int((look >= 0).sum()))
-        centroids, labels = kmeans2(known, number, minit="++", seed=generator, missing="warn")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # an empty cluster is left out
+            centroids, labels = kmeans2(known, number, minit="++", seed=generator)
         return self._fitted(rule, look, centroids[np.unique(labels)])
 
     def _reassigned(self, chosen: ChosenPatterns) -> ChosenPatterns:
@@ -324,12 +326,19 @@ def _numbers(most: int) -> list[int]:
     return sorted({*(2**power for power in range(1, most.bit_length())), most} - {0, 1})
 
 
+@phase("what returns tell")
 def training_frames(
     training: TrainingScenes, purpose: str, rays: Rays, share: float, features: Features | None
 ) -> Frames:
     """Frames of as many training scenes as patterns are chosen on, or of a quarter as many scenes held back."""
-    frames = training.first(purpose)[0].frames
-    part = 1.0 if purpose == CHOICE else HELD_BACK_SHARE
-    scenes = itertools.islice(training.scenes(purpose), round(part * min(-(-WANTED_FRAMES // frames), MOST_SCENES)))
-    items = MOST_ITEMS if purpose == CHOICE else MOST_ITEMS_HELD_BACK
-    return frames_of(training.run.task, list(scenes), rays, share, training.seed, features, items)
+    frames, is_choice = training.first(purpose)[0].frames, purpose == CHOICE
+    wanted = min(-(-WANTED_FRAMES // frames), MOST_SCENES) * (1.0 if is_choice else HELD_BACK_SHARE)
+    items = MOST_ITEMS if is_choice else MOST_ITEMS_HELD_BACK
+    work = partial(frames_of_scene, training.run.task, rays, share, training.seed, features, items)
+    found = training.over(work, itertools.islice(training.scenes(purpose), round(wanted)))
+    seen = [one.features for one in found if one.features is not None]
+    return Frames(
+        [informed for one in found for informed in one.informed],
+        np.concatenate([one.range_m for one in found]),
+        np.concatenate(seen) if seen else None,
+    )

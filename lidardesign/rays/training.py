@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from typing import TypeVar
 
 import numpy as np
 
@@ -30,6 +31,7 @@ MARGIN_SIGMAS = 2.0  # by which gates are longer than what training scenes retur
 # Chosen on, and held back from the choice.
 CHOICE, HELD_BACK = "choice", "held back"
 Informs = Callable[[Scene, Sequence[Returns]], Information]
+Found = TypeVar("Found")
 LARGEST = np.zeros(0)  # the table of sums of items whose largest worth counts
 
 
@@ -91,9 +93,12 @@ class TrainingScenes:
         """
         kept = self._first.get(purpose, [])
         scenes = kept[start:stop] if stop <= len(kept) else itertools.islice(self.scenes(purpose, start), stop - start)
-        asked = ((scene, number) for number, scene in enumerate(scenes, start))
         work = partial(informed_scene, self.run.task, rays, visits, share, self.seed, purpose)
-        return list(self._starmap(work, asked))
+        return self.over(work, scenes, start)
+
+    def over(self, work: Callable[[Scene, int], Found], scenes: Iterable[Scene], start: int = 0) -> list[Found]:
+        """What some work finds in scenes and their numbers, here or by workers."""
+        return list(self._starmap(work, ((scene, number) for number, scene in enumerate(scenes, start))))
 
 
 def informed_scene(
