@@ -206,8 +206,10 @@ def student_interval(
 
 
 def _straightened(quantile: float, bend: float) -> float:
-    """The t statistic at which Hall's transform, a cubic without the bend, has a quantile."""
-    return quantile if bend == 0 else float(np.cbrt(1 + 3 * bend * (quantile - bend / 2)) - 1) / bend
+    """The t statistic at which Hall's transform, a cubic, has a quantile: (cbrt(1 + 3 b (q - b / 2)) - 1) / b."""
+    moved = quantile - bend / 2
+    root = float(np.cbrt(1 + 3 * bend * moved))
+    return 3 * moved / (root**2 + root + 1)  # the same without the difference of two near numbers
 
 
 def paired_difference(

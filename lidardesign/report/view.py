@@ -273,7 +273,8 @@ def view_notes(shown: SceneFigure) -> list[str]:
     if len(shown.frames) < shown.scene.frames:
         left_out.append(f"{len(shown.frames)} of {shown.scene.frames} frames are shown")
     if len(shown.places) < shown.all_places:
-        left_out.append(f"{len(shown.places)} of {shown.all_places} patterns or positions are shown")
+        steps = "patterns" if PATTERN in shown.places[0] else "positions"
+        left_out.append(f"{len(shown.places)} of {shown.all_places} {steps} are shown")
     left_out += [f"{name} fires {_runs(patterns, shown.scene)}" for name, patterns in shown.fired.items()]
     for one in shown.designs:
         if len(one.rays[0]) < one.fired:

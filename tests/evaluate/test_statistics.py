@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import t, ttest_1samp
 
 from lidardesign.errors import NumericalError
-from lidardesign.estimates import mean_interval, paired_difference, relative_difference
+from lidardesign.estimates import mean_interval, paired_difference, relative_difference, student_interval
 
 TRIALS = 1000
 # Of scores of two designs with mean 1: what one group adds, and a usual scene.
@@ -22,6 +22,12 @@ def test_the_interval_of_a_sample_without_skewness_is_that_of_student(count):
     values = 2.0 + np.concatenate([half, -half])
     expected = ttest_1samp(values, 0.0).confidence_interval(0.95)
     np.testing.assert_allclose(mean_interval(values)[1:], (expected.low, expected.high), rtol=1e-9)
+
+
+@pytest.mark.parametrize("skewness", [-1e-6, -1e-17, 1e-300, 1e-12, 1e-7])
+def test_hardly_any_skewness_hardly_moves_an_end(skewness):
+    found, straight = (student_interval(1.0, 0.5, 9.0, one) for one in (skewness, 0.0))
+    np.testing.assert_allclose(found, straight, rtol=10 * abs(skewness) + 1e-15)
 
 
 @pytest.mark.parametrize("count", [3, 10, 50])
