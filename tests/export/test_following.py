@@ -32,6 +32,8 @@ def test_the_code_of_the_page_fires_what_we_fire(tmp_path_factory, design, data)
     code = re.search(r"```python\n(# follow.py.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL).group(1)
     theirs: dict = {}
     exec(code.replace("follow.npz", str(folder / "follow.npz")), theirs)
+    with theirs["table"] as arrays:
+        theirs["table"] = dict(arrays)
     rays, rule = design.adaptive.rays(), design.adaptive.rule
     range_m = np.array(
         data.draw(st.lists(st.floats(0.1, 9) | st.just(np.nan), min_size=rule.looks, max_size=rule.looks))
@@ -54,7 +56,6 @@ def test_the_code_of_the_page_fires_what_we_fire(tmp_path_factory, design, data)
         pattern = rule.pattern_of(features)
         assert theirs["pattern_of"](features) == pattern
         fired = [theirs["rays_of"](pattern)]
-    theirs["table"].close()
     ours = ray_columns(rays[pattern])
     np.testing.assert_array_equal(np.concatenate(fired), np.stack([ours[name] for name in theirs["COLUMNS"]], axis=1))
 
