@@ -346,8 +346,11 @@ class Fitter:
         return replace(result, notes=(*notes, *result.notes))
 
     def _if_better(self, design: DesignSpec, notes: list[str]) -> DesignSpec:
-        """The design with its adaptive patterns where they score better on training scenes held back, else without."""
-        from lidardesign.fitting.trials import Trial, trial_of
+        """The design with its adaptive patterns where they score better on training scenes held back, else without.
+
+        They do where the gain is more than its standard error.
+        """
+        from lidardesign.fitting.trials import Trial, best_of, trial_of
 
         metric, adaptive = self.request.run.metric, design.adaptive
         if adaptive is None:
@@ -359,14 +362,14 @@ class Fitter:
             fixed = trial_of(self.request, design, len(adaptive))
             features = features_of(self.training.run.task)
             following = Trial(fixed.sensors, adaptive.rays(features)).lit(self.request, design)
-            self.scenes.score([fixed, following], FEW_SCENES)
+            best = best_of([fixed, following], self.scenes, metric, 0.0, most=2 * FEW_SCENES)
         before, after = fixed.scores.mean(), following.scores.mean()
         looks = f" behind a first look of {adaptive.rule.looks} rays" if adaptive.rule.looks else ""
         text = (
             f"{len(adaptive.patterns)} patterns{looks} score {after:.4g} {metric.unit} on training scenes held back, "
         )
         text += f"the best single one {before:.4g}"
-        if (after < before) == (metric.better == "lower") and after != before:
+        if best is following:
             notes.append(text)
             return design
         notes.append(f"one pattern: {text}")
