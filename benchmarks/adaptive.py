@@ -18,7 +18,7 @@ from baselines import told
 from common import face_settings, lidardesign, parser, report, run_process, without_traceback
 from returns import humanoid_settings
 
-HELD_OUT_SEED = "2028"
+HELD_OUT_SEED = "2031"  # nothing was tried on its scenes
 DETECTORS = {"ideal": (), "0 klux": ("--detector", "single-photon", "--set", "illuminance_lux=0")}
 DETECTORS |= {"100 klux": ("--detector", "single-photon", "--set", "illuminance_lux=100000", "--set", "light=sun")}
 

@@ -169,6 +169,16 @@ def plugin_guard(name: str) -> Iterator[None]:
         ) from error
 
 
+@contextlib.contextmanager
+def plugin_method(name: str, method: str, where: str) -> Iterator[None]:
+    """Run a plugin's method as `plugin_guard` does; its errors say which method failed, and where."""
+    try:
+        with plugin_guard(name):
+            yield
+    except PluginError as error:
+        raise PluginError(f"{method} failed: {error.message}", where=where, hint=error.hint) from error
+
+
 def text_of(error: BaseException) -> str:
     """Message of an error in one line, even if its class fails to make one."""
     try:

@@ -72,7 +72,7 @@ def check_design(document: Mapping[str, Any], constraints: Any, space: Any = Non
     rules = constraints.as_document() if hasattr(constraints, "as_document") else dict(constraints or {})
     bounds = space.as_dict() if hasattr(space, "as_dict") else space
     z = NormalDist().inv_cdf((1 + float(document.get("level", 0.95))) / 2)
-    patterns = [*(document.get("patterns") or []), *(_get(document, "adaptive", "patterns") or [])]
+    patterns = _patterns(document)
     sensors, each = list(document["sensors"]), list(rules.get("each") or [])
     own_rules = [_over(rules, each[index]) if index < len(each) else rules for index in range(len(sensors))]
     checks = _between("sensors", len(sensors), rules.get("sensors"))
@@ -107,6 +107,11 @@ def _get(values: Any, *keys: str) -> Any:
     for key in keys:
         values = values.get(key) if isinstance(values, Mapping) else None
     return values
+
+
+def _patterns(document: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """All patterns of a design, also those that follow what they see."""
+    return [*(document.get("patterns") or []), *(_get(document, "adaptive", "patterns") or [])]
 
 
 def _slack(bound: float) -> float:
@@ -313,8 +318,7 @@ def _astray(pattern: Mapping[str, Any], sensors: Sequence[Mapping[str, Any]]) ->
 def _budget(document: Mapping[str, Any], budget: Mapping[str, Any]) -> list[ConstraintCheck]:
     """Checks of the number of rays and their bandwidth: rays times whole bins times bits times frames [Mbit/s]."""
     bin_m = LIGHT_M_PER_S * budget.get("bin_ps", 100.0) * PICOSECOND_S / 2
-    patterns = [*(document.get("patterns") or ()), *(_get(document, "adaptive", "patterns") or ())]
-    widths = [_pattern_widths(pattern, bin_m) for pattern in patterns]
+    widths = [_pattern_widths(pattern, bin_m) for pattern in _patterns(document)]
     asked, limit, checks = budget.get("rays"), budget.get("bandwidth_mbps"), []
     own = _get(document, "constraints", "budget", "rays")
     rays = asked if own is None else own

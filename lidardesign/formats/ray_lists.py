@@ -274,8 +274,7 @@ def write_csv(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
 
 
 def write_npz(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
-    """Write an array per column, the sensors' names, and the rule of patterns that follow what they see; returns notes
-    of what the format cannot hold."""
+    """Write an array per column, names of sensors, and a rule of patterns; returns notes of what is lost."""
     buffer = io.BytesIO()
     names = np.array([sensor.name for sensor in design.sensors], dtype=np.str_)
     columns, rule = pattern_columns(design, rays)

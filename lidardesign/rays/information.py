@@ -16,7 +16,7 @@ import numpy as np
 
 from lidardesign.errors import PluginError
 from lidardesign.numerics import SLACK
-from lidardesign.registry import plugin_guard
+from lidardesign.registry import plugin_method
 from lidardesign.scenes.rays import Returns
 from lidardesign.scenes.scene import Scene
 from lidardesign.sensors.adaptive import Features
@@ -60,11 +60,8 @@ def checked_information(task: Task, scene: Scene, returns: Sequence[Returns]) ->
         PluginError: The task's code raised, or returned something else or invalid values.
     """
     where = f"task {task.name}, informs, scene {scene.name}"
-    try:
-        with plugin_guard(task.name):
-            answer = task.informs(scene, returns)
-    except PluginError as error:
-        raise PluginError(f"informs failed: {error.message}", where=where, hint=error.hint) from error
+    with plugin_method(task.name, "informs", where):
+        answer = task.informs(scene, returns)
     if not isinstance(answer, Information):
         allowed = "lidardesign.task.Information"
         raise PluginError(f"informs returned {type(answer).__name__}", where=where, allowed=allowed)
@@ -83,11 +80,8 @@ def features_of(task: Task) -> Features | None:
 
 def _checked_features(task: Task, scene: Scene, returns: Returns) -> np.ndarray:
     where = f"task {task.name}, features, scene {scene.name}"
-    try:
-        with plugin_guard(task.name):
-            found = task.features(scene, returns)
-    except PluginError as error:
-        raise PluginError(f"features failed: {error.message}", where=where, hint=error.hint) from error
+    with plugin_method(task.name, "features", where):
+        found = task.features(scene, returns)
     try:
         features = np.asarray(found, dtype=np.float64)
     except (TypeError, ValueError):

@@ -24,7 +24,7 @@ from lidardesign.sensors.sensor import Sensor, interval_factor
 from lidardesign.space import AZIMUTH, DIMENSIONS, ELEVATION, RANGE, DesignSpace, aim, direction, observed_point
 
 CANDIDATES_PER_RAY = 5
-# Of rays that start all over regions: 100 rays of 2,000 track with 42 % less error than of 500; more bring nothing.
+# Of rays that start all over regions: 100 rays of 2,000 track with 14 % less error than of 500, in one run of the arm.
 LEAST_CANDIDATES_OF_REGIONS = 2000
 NEAREST_SHARE = 0.1  # of the samples along a condition that propose rays at one of its values
 # A direction or range without spread has no density. These smallest spreads, far below any that matters,

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lidardesign.errors import PluginError
-from lidardesign.registry import plugin_guard
+from lidardesign.registry import plugin_method
 from lidardesign.run.clock import Progress, phase
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import Rays, Returns
@@ -147,11 +147,8 @@ def checked_score(task: Task, metric: Metric, scene: Scene, returns: Sequence[Re
         PluginError: The task's score raised, or returned something that is no finite score.
     """
     where = f"task {task.name}, metric {metric.name}, scene {scene.name}"
-    try:
-        with plugin_guard(task.name):
-            score = task.score(scene, returns)
-    except PluginError as error:
-        raise PluginError(f"scoring failed: {error.message}", where=where, hint=error.hint) from error
+    with plugin_method(task.name, "scoring", where):
+        score = task.score(scene, returns)
     if not isinstance(score, Score):
         raise PluginError(f"score returned {type(score).__name__}", where=where, allowed="lidardesign.task.Score")
     if not isinstance(score.details, Mapping) or not all(isinstance(name, str) for name in score.details):

@@ -224,7 +224,7 @@ Least = Annotated[
 ]
 Adaptive = Annotated[
     int | None,
-    typer.Option("--adaptive", metavar="N", help="At most so many patterns follow what they see.", show_default="1"),
+    typer.Option("--adaptive", metavar="N", help="At most N patterns; returns pick the next one.", show_default="1"),
 ]
 Preset = Annotated[
     str | None,
