@@ -9,13 +9,14 @@ in an ideal world and with single photons. What was measured is kept in the fold
 from __future__ import annotations
 
 import json
+import re
 import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from baselines import told
-from common import face_settings, lidardesign, parser, report, run_process, without_traceback
+from common import ARM_MODEL, face_settings, lidardesign, parser, report, run_process, without_traceback
 from returns import humanoid_settings
 
 HELD_OUT_SEED = "2031"  # nothing was tried on its scenes
@@ -45,6 +46,10 @@ def cases() -> dict[str, Case]:
         "arm": Case("arm", (), (100, 400), ("--sensors", "4", "--adaptive", "16"), lit_scenes=20),
         "head model": Case("face", model, (361,), fine),
     }
+    links = f"folder={ARM_MODEL.parent / 'assets'}"
+    if ARM_MODEL.exists():
+        found["meshes of a robot's links"] = Case("meshes", (links, "poses=40"), (100,))
+        found["piles of four links"] = Case("meshes", (links, "poses=40", "clutter=4"), (100,))
     humanoid = humanoid_settings()
     if humanoid is not None:
         keys = tuple(f"{k}={json.dumps(v) if isinstance(v, list) else v}" for k, v in humanoid.items() if k != "metric")
@@ -59,7 +64,7 @@ def document(*words: str | Path) -> dict[str, Any]:
 
 def measured(title: str, options: Any) -> list[dict[str, Any]]:
     """What `evaluate` prints for each number of rays and detector; made where it is missing."""
-    case, place = cases()[title], options.folder / title.replace(", ", "-").replace(" ", "-")
+    case, place = cases()[title], options.folder / re.sub("[^a-z]+", "-", title)
     kept = place.with_suffix(f".{options.seeds}.json")
     if kept.exists():
         return json.loads(kept.read_text(encoding="utf-8"))

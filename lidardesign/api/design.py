@@ -251,10 +251,12 @@ class Design(DesignSource):
         """The document of `lidardesign fit --json`: sensors, and what the fit found."""
         place = self.name if self.path is None else str(self.path)
         certificates = certificates_of(self.specification)
-        further = {"certificates": certificates} if certificates else {}
+        further: dict[str, Any] = {"certificates": certificates} if certificates else {}
+        if (adaptive := self.specification.adaptive) is not None:
+            further["adaptive"] = {"looks": adaptive.rule.looks, "shares": adaptive.shares.tolist()}
         if self.result is None:
             sensors = [sensor.as_dict() for sensor in self.specification.sensors]
-            return {"design": place, "frame": self.specification.mount or "world", "sensors": sensors}
+            return {"design": place, "frame": self.specification.mount or "world", "sensors": sensors, **further}
         return {**self.result.as_dict(), "design": place, **further}
 
     def __repr__(self) -> str:

@@ -146,12 +146,15 @@ class TestTheChecker:
 class TestAFit:
     @pytest.mark.parametrize("rays", [8, 12])
     def test_keeps_patterns_that_are_better_and_says_so_where_one_is(self, lidardesign, run, rays):
-        done = lidardesign("fit", run, "--adaptive", 2, "--rays", rays, "--sensors", 1, "--name", f"f{rays}", "-v")
+        done = lidardesign("fit", run, "--adaptive", 2, "--rays", rays, "--sensors", 1, "--name", f"f{rays}", "--json")
         assert done.code == 0, done.err
         spec = open_run(run).fit(adaptive=2, rays=rays, sensors=1, name=f"f{rays}").specification
         written = load_design(run / "designs" / f"f{rays}.yaml")
         assert design_document(written)["patterns"] == design_document(spec)["patterns"]
         assert (written.adaptive is None) == (spec.adaptive is None) == ("one pattern" in done.out + done.err)
+        said = done.json.get("adaptive")
+        assert (said is None) == (spec.adaptive is None)
+        assert said is None or said == {"looks": spec.adaptive.rule.looks, "shares": spec.adaptive.shares.tolist()}
         assert spec.adaptive is None or {len(one) for one in spec.adaptive.patterns} == {rays}
 
     def test_is_scored_beside_its_best_single_pattern(self, lidardesign, run, found):
