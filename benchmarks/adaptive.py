@@ -80,8 +80,9 @@ def measured(title: str, options: Any) -> list[dict[str, Any]]:
     for rays in case.rays:
         for light, words in DETECTORS.items() if case.lit_scenes else [("ideal", ())]:
             scenes = 100 if light == "ideal" else case.lit_scenes
-            which = ("--designs", f"a{rays}", "--rays", str(rays), "--scenes-seed", HELD_OUT_SEED)
-            scores = document("evaluate", *runs, *which, "--set", f"test={scenes}", "--baseline", "none", *words)
+            which = ("--designs", f"a{rays}", "--rays", str(rays), "--scenes-seed", HELD_OUT_SEED, "--baseline", "none")
+            shown = ("--set", "poses=20" if case.task == "meshes" else f"test={scenes}")  # of six or seven links
+            scores = document("evaluate", *runs, *which, *shown, *words)
             found.append({"rays": rays, "light": light, **scores})
     kept.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     return found

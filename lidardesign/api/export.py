@@ -19,7 +19,7 @@ from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.design import DesignSpec
 
 # Formats that hold sensors only.
-WITHOUT_RAYS = ("sensors-csv", "stl")
+WITHOUT_RAYS = ("sensors-csv", "stl", "mounts")
 
 
 class DesignSource:

@@ -249,6 +249,16 @@ EXPORTERS: dict[str, Exporter] = {
             folder=True,
         ),
         Exporter(
+            "mounts",
+            ".mounts",
+            "a page to mount from, the same as CSV, and ROS frames",
+            "lidardesign.formats.mount_page",
+            "write_mounts",
+            reader="people who build it; ROS",
+            checked="a design is built from the CSV in MuJoCo: all ranges agree",
+            folder=True,
+        ),
+        Exporter(
             "ply",
             ".ply.d",
             "rays as points, beams as edges, fields of view as surfaces",

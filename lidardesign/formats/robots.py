@@ -269,20 +269,22 @@ def _base() -> list[Element]:
 
 def mounted_parts(mount: Mount, rate_hz: float, *, parent: str, prefix: str = "") -> list[Element]:
     """Link of a sensor, the joint that fixes it to a parent, and Gazebo's sensor on it."""
-    name = f"{prefix}{mount.name}_link"
-    joint = element(
-        "joint",
-        {"name": f"{prefix}{mount.name}_joint", "type": "fixed"},
-        [
-            element("parent", {"link": parent}),
-            element("child", {"link": name}),
-            element("origin", {"xyz": numbers(mount.origin_m), "rpy": numbers(mount.roll_pitch_yaw_rad)}),
-        ],
-    )
-    sensor = sensor_element(mount, rate_hz, posed=False, name=f"{prefix}{mount.name}")
+    name = f"{prefix}{mount.name}"
+    link, joint = fixed_link(name, mount.origin_m, mount.roll_pitch_yaw_rad, parent=parent)
+    sensor = sensor_element(mount, rate_hz, posed=False, name=name)
     # Gazebo then publishes in the frame of the link, whose name ROS knows
-    sensor.append(element("gz_frame_id", text=name))
-    return [element("link", {"name": name}), joint, element("gazebo", {"reference": name}, [sensor])]
+    sensor.append(element("gz_frame_id", text=f"{name}_link"))
+    return [link, joint, element("gazebo", {"reference": f"{name}_link"}, [sensor])]
+
+
+def fixed_link(
+    name: str, origin_m: np.ndarray, roll_pitch_yaw_rad: Sequence[float], *, parent: str
+) -> tuple[Element, Element]:
+    """The link of a sensor, and the joint that fixes it to a parent."""
+    ends = [element("parent", {"link": parent}), element("child", {"link": f"{name}_link"})]
+    origin = element("origin", {"xyz": numbers(origin_m), "rpy": numbers(roll_pitch_yaw_rad)})
+    joint = element("joint", {"name": f"{name}_joint", "type": "fixed"}, [*ends, origin])
+    return element("link", {"name": f"{name}_link"}), joint
 
 
 MACRO = "xacro:macro"

@@ -105,6 +105,20 @@ class PartFieldOfView(Statement):
         return self
 
 
+class Mounting(Statement):
+    """How a part is mounted; what no source says is left out.
+
+    Arguments:
+        up: Which side of it points up where its pattern is upright.
+        zone_0: Where its first zone looks, as seen along its axis.
+        origin: The point of it that rays start from.
+    """
+
+    up: Text | None = None
+    zone_0: Text | None = None
+    origin: Text | None = None
+
+
 class _Cells(Statement):
     """Rows and columns of rays."""
 
@@ -191,6 +205,7 @@ class Figures(_Keys):
         returns: Echoes per ray at most.
         wavelength_nm, divergence_mrad, power_w: Of its light; power is what the part consumes.
         price: In the currency of whoever compares prices.
+        mounting: How it is mounted.
         noise_m: Standard deviation of a range.
         accuracy_m, accuracy_percent: The largest error of a range, or its share.
         bins, bin_ps, bits_per_bin: The histogram that it gives per ray, where it gives one.
@@ -218,6 +233,7 @@ class Figures(_Keys):
     points_per_s: Values | None = None
     power_w: Values | None = None
     price: Values | None = None
+    mounting: Annotated[list[Mounting], Field(min_length=1)] | None = None
 
 
 FIELDS = tuple(Figures.model_fields)
