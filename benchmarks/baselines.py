@@ -100,7 +100,7 @@ def measured_on() -> str:
 def standing(pair: Mapping[str, Any], better: str) -> str:
     """Whether `a` is better than `b` by more than the interval."""
     if pair["ci_low"] * pair["ci_high"] <= 0:
-        return "no difference found"
+        return "no significant difference"
     lower = pair["difference"] < 0
     return "better" if lower == (better == "lower") else "worse"
 

@@ -65,7 +65,7 @@ def paired_rows(found: dict[str, Any], key: str) -> list[list[object]]:
             continue
         low, high = pair["ci_low"], pair["ci_high"]
         decided = "better" if sign * low + sign * high < 0 else "worse"
-        standing = decided if low * high > 0 else "no difference found"
+        standing = decided if low * high > 0 else "no significant difference"
         interval = f"{low:.2f} to {high:.2f}"
         rows.append([pair["a"], pair["b"], pair["rays"], pair["difference"], interval, standing])
     return rows

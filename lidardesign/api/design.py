@@ -119,6 +119,7 @@ class Design(DesignSource):
         survive: int | None = None,
         goal: float | None = None,
         least: str | None = None,
+        adaptive: int | None = None,
         workers: int | str = 1,
         notes: Notes = log_note,
         progress: Progress | None = None,
@@ -145,6 +146,7 @@ class Design(DesignSource):
             survive: 1: rays are chosen for the loss of any one sensor, too; by default as constraints say.
             goal: The score that it has to keep on training scenes that were held back, in the metric's unit.
             least: What it then has the least of: bandwidth (the default), rays, sensors or parts.
+            adaptive: At most so many patterns follow what they see; 1 for none.
             workers: Processes that look at training scenes, or the address of a dask scheduler, tcp://HOST:PORT.
             notes: Called with every note.
             progress: Called with every step, as "choosing 361 rays", and twice None.
@@ -174,6 +176,7 @@ class Design(DesignSource):
             survive=survive,
             goal=goal,
             least=least,
+            adaptive=adaptive,
         )
         request = FitRequest.resolve(run, options, self.specification, notes=notes)
         return Design.fitted(request, workers=workers, notes=notes, progress=progress)

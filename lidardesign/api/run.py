@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Any
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from lidardesign.api.design import Design, html_table
 from lidardesign.api.learn import LearnOptions, LearnRequest, check_tolerance
 from lidardesign.constraints.document import Constraints
-from lidardesign.errors import DataError, LidardesignError, names_arguments
+from lidardesign.errors import ConfigError, DataError, LidardesignError, names_arguments
 from lidardesign.fitting.options import FitOptions
 from lidardesign.fitting.request import FitRequest
 from lidardesign.formats.designs import folder_of, reach_of, read_design
@@ -20,6 +20,7 @@ from lidardesign.run.files import writer
 from lidardesign.run.manifest import DAMAGED_HINT, read_manifest
 from lidardesign.run.outputs import CACHE
 from lidardesign.run_folder import MANIFEST, Notes, RunFolder, log_note
+from lidardesign.task import mount_of
 
 if TYPE_CHECKING:
     from lidardesign.api.scores import Scores
@@ -231,6 +232,44 @@ class Run(RunFolder):
             "writer": at_work,
             "next": [] if learned is None and at_work else self._next_commands(designs, finished=learned is not None),
         }
+
+    @names_arguments
+    def save_baseline(
+        self, baseline: str, *, rays: int | None = None, name: str | None = None, seed: int | None = None
+    ) -> Design:
+        """The design that fires exactly the rays of a baseline, each with the baseline's gate, saved in the run.
+
+        Arguments:
+            baseline: Its name, as "greedy" or "bounding".
+            rays: Rays per frame; the task's middle number by default.
+            name: The design's name; "greedy-rays" for greedy.
+            seed: Seed of all random numbers; the run's by default.
+
+        Raises:
+            ConfigError: No such baseline, or one without rays of its own that stay the same in every scene.
+        """
+        from lidardesign.api.scores import evaluation_request
+        from lidardesign.formats.rig import Rig, RigSensor, rig_design
+        from lidardesign.scoring.baselines.simple import check_baseline
+        from lidardesign.scoring.evaluation.entries import entries_of
+
+        check_baseline(baseline)
+        numbers = sorted(self.task.defaults.rays)
+        count = numbers[len(numbers) // 2] if rays is None else rays
+        allowed = "uniform, bounding, silhouette, lloyd, greedy"
+        found = []
+        if baseline in allowed.split(", "):
+            request = evaluation_request(self, [], [count], [baseline], seed)
+            found = entries_of(replace(request, equal_bandwidth=False))
+        if len(found) != 1 or len(found[0].positions) > 1:
+            raise ConfigError(f"{baseline} has no fixed list of {count} rays here", where="baseline", allowed=allowed)
+        fired = found[0].positions[0].as_angles()
+        sensor = RigSensor("s0", fired.origin_m, fired.azimuth_rad, fired.elevation_rad, fired.gate_m)
+        design = rig_design(Rig(f"baseline {baseline}", [sensor], [], ""), Path(baseline), None)
+        mount = mount_of(self.task, self.config.task)
+        made = Design(replace(design, name=name or f"{baseline}-rays", mount=mount), self)
+        made.save()
+        return made
 
     def _next_commands(self, designs: Sequence[Mapping[str, Any]], *, finished: bool) -> list[str]:
         """Command lines of the next steps."""

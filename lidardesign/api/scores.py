@@ -249,6 +249,7 @@ class ScoreRequest:
             mount_error=misplaced,
             losses=self.options.losses,
             alone=self.alone,
+            named=tuple(self.options.baselines),
         )
 
     def score(self, progress: Progress | None = None, searching: Show | None = None) -> Scores:

@@ -413,7 +413,7 @@ def _admitted_part(name: str, named: Sequence[str]) -> Part | None:
     except ConfigError:
         return None
     stem = name.partition(":")[0]
-    file = Path(library.origins[stem])
+    file = Path(part.origin)
     admitted = any(
         (entry == stem if path is None else path in (file, file.parent)) and mode in ("", part.mode)
         for path, entry, mode in entries

@@ -22,15 +22,18 @@ from lidardesign.parts.statements import PartFile
 from lidardesign.run.clock import phase
 from lidardesign.run.validation import check_model, suggest
 from lidardesign.run.yaml import load_yaml
-from lidardesign.scenes.rays import Rays
+from lidardesign.scenes.rays import DEFAULT_RATE_HZ, Rays
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.pattern import Pattern, even_subset, grid_rows, grid_tangent
 from lidardesign.sensors.sensor import MOST_RAYS, Sensor, boresight_frame, boresight_of
+from lidardesign.space import FARTHEST_M
 
 FOLDER = Path(__file__).parent / "files"
 SHIPPED = "lidardesign"
 SUFFIX = ".yaml"
 STEM = re.compile(r"[a-z0-9][a-z0-9._-]{0,60}")
+MODULE_PREFIX = "module-"
+MODULE = re.compile(MODULE_PREFIX + r"(\d+\.?\d*)x(\d+\.?\d*)-(\d{1,7})x(\d{1,7})", re.ASCII)
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,11 +54,13 @@ class Library:
         return sorted(self.files)
 
     def part(self, name: str) -> Part:
-        """A part by `NAME` or `NAME:MODE`.
+        """A part by `NAME` or `NAME:MODE`, or a module by its field of view and its zones, as `module-45x45-8x8`.
 
         Raises:
             ConfigError: There is no such part or mode.
         """
+        if name.startswith(MODULE_PREFIX):
+            return _module(name)
         stem, colon, mode = name.partition(":")
         if stem not in self.files:
             raise ConfigError(
@@ -176,6 +181,34 @@ def _named(names: Sequence[str] | str) -> list[Part]:
         if not found:
             raise _no_part_files(text)
     return [find_part(name) for name in dict.fromkeys(itertools.chain.from_iterable(inside))]
+
+
+def _module(name: str) -> Part:
+    """A module of even zones that no part file describes: it measures at any range.
+
+    Raises:
+        ConfigError: A name that says no field of view or zones, or impossible ones.
+    """
+    found = MODULE.fullmatch(name)
+    if found is None:
+        raise ConfigError(
+            f"{name!r} is no module",
+            where="parts",
+            allowed="a field of view in degrees and a number of zones, each across x up: --fov 45x45 --zones 8x8",
+        )
+    across, up = (float(text) / 2 for text in found.groups()[:2])
+    columns, rows = map(int, found.groups()[2:])
+    figures = {
+        "pattern": [{"kind": "zones", "columns": columns, "rows": rows, "source": "you"}],
+        "field_of_view_deg": [{"azimuth": [-across, across], "elevation": [-up, up], "source": "you"}],
+        "near_m": [{"value": 0.0, "source": "you"}],
+        "far_m": [{"value": FARTHEST_M, "source": "you"}],
+        "rate_hz": [{"value": DEFAULT_RATE_HZ, "source": "you"}],
+        "sources": {"you": {"title": "the name of the module", "kind": "list"}},
+    }
+    about = {"maker": "any", "product": name, "kind": "multi-zone", "summary": "a module of even zones"}
+    file = check_model(PartFile, {"schema_version": 1, **about, **figures}, lambda *_, **__: name)
+    return Part.of_file(name, file, None, SHIPPED)
 
 
 @lru_cache(maxsize=1)

@@ -51,27 +51,36 @@ def far_baselines(evaluation: Evaluation) -> set[str]:
             worst[row.rays] = max(sign * row.value, worst.get(row.rays, -math.inf))
     baselines = [row for row in evaluation.rows if row.baseline and row.rays in worst]
     near = {row.design for row in baselines if sign * row.value - worst[row.rays] <= FAR_SHARE * abs(worst[row.rays])}
-    return {row.design for row in baselines} - near - {baseline.name if baseline is not None else ""}
+    strongest = {baseline.name} if baseline is not None else set()
+    return {row.design for row in baselines} - near - strongest - set(evaluation.named)
 
 
 def curve_figure(evaluation: Evaluation, against: Against, hidden: Collection[str] = ()) -> dict[str, Any]:
-    """Score against rays or bandwidth: a line and an interval band per name, some of them hidden at first."""
+    """Score against rays or bandwidth: a line and an interval band per name, some of them hidden at first.
+
+    At one number of rays there are bars instead.
+    """
     curves = series(evaluation)
     across, up = axis_titles(evaluation, against)
     rows = [row for curve in curves for row in curve.rows]
     places = [position(row, against) for row in rows]
     ends = [end for curve in curves if curve.name not in hidden for row in curve.rows for end in row.drawn_interval]
-    ticks = {"tickvals": sorted(set(places))} if against == "rays" else {}
+    has_bars = against == "rays" and len(set(places)) == 1
+    numbered = {"tickvals": sorted(set(places)), "tickformat": "~g"} if against == "rays" else {"tickformat": "~g"}
+    ticks = {"type": "category", "automargin": True} if has_bars else {**_scale(places), **numbered}
+    # shares are compared by what is between them, and bars by their lengths
+    is_linear = has_bars or evaluation.metric.unit == "%"
+    values = {"type": "linear"} if is_linear else _scale([row.value for row in rows], ends)
     axis = {"gridcolor": "#e4e7eb", "zeroline": False, "linecolor": "#9aa5b1", "ticks": "outside"}
     layout = {
         "font": FONT,
         "paper_bgcolor": "#ffffff",
         "plot_bgcolor": "#ffffff",
         "margin": {"l": 74, "r": 16, "t": 12, "b": 56},
-        "xaxis": {**axis, **_scale(places), **ticks, "tickformat": "~g", "title": {"text": across}},
+        "xaxis": {**axis, **ticks, "title": {"text": f"at {places[0]:g} rays" if has_bars else across}},
         "yaxis": {
             **axis,
-            **_scale([row.value for row in rows], ends),
+            **values,
             "tickformat": "~g",
             "automargin": True,
             "title": {"text": html.escape(up).replace(", ", "<br>"), "font": {"size": 13}},
@@ -80,7 +89,9 @@ def curve_figure(evaluation: Evaluation, against: Against, hidden: Collection[st
         "hovermode": "closest",
     }
     traces = [
-        {**trace, "visible": curve.name not in hidden} for curve in curves for trace in _curve_traces(curve, against)
+        {**trace, "visible": curve.name not in hidden}
+        for curve in curves
+        for trace in (_bar_traces(curve) if has_bars else _curve_traces(curve, against))
     ]
     return {"data": traces, "layout": layout}
 
@@ -141,6 +152,14 @@ def _curve_traces(curve: Series, against: Against) -> list[dict[str, Any]]:
         "hovertemplate": "%{y:.4g}<br>%{text}<extra>%{fullData.name}</extra>",
     }
     return [band, line]
+
+
+def _bar_traces(curve: Series) -> list[dict[str, Any]]:
+    """A bar with its interval; the empty first trace is that of a curve's band."""
+    point = _curve_traces(curve, "rays")[1]
+    shared = {key: point[key] for key in ("y", "error_y", "name", "legendgroup", "text", "hovertemplate")}
+    bar = {**shared, "type": "bar", "x": [point["name"]], "textposition": "none", "marker": {"color": curve.colour}}
+    return [{"type": "bar", "x": [], "y": [], "showlegend": False, "legendgroup": point["name"]}, bar]
 
 
 def marginal_figure(marginal: Marginal, looks: Mapping[str, Series]) -> dict[str, Any]:

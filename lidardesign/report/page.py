@@ -47,9 +47,9 @@ from lidardesign.run.files import write_atomic
 from lidardesign.run.manifest import read_manifest, versions
 from lidardesign.scoring.evaluation.request import EvaluationRequest
 from lidardesign.scoring.evaluation.results import Evaluation, Paired, Row, verdict
-from lidardesign.scoring.evaluation.thresholds import difference_text
+from lidardesign.scoring.evaluation.thresholds import headline_texts
 from lidardesign.scoring.sweep import Sweep
-from lidardesign.sensors.design import DesignSpec, certificates_of
+from lidardesign.sensors.design import MOST_GAP, DesignSpec, certificates_of
 from lidardesign.space import observed_point
 from lidardesign.task import random_generator
 
@@ -177,9 +177,11 @@ def _parts(report: Report) -> list[tuple[str, str, str]]:
     looks = {name: replace(look, dash=DASHES[index % len(DASHES)]) for index, (name, look) in enumerate(looks.items())}
     shown = [looks[one.name] for one in designs]
     constraints = "".join(constraints_table(name, bounds) for name, bounds in report.constraints.items())
-    sensors = "".join(folded(f"Sensors of {one.name}", sensors_table(one), len(one.sensors)) for one in designs)
+    tables = [(f"Sensors of {one.name}", sensors_table(one), len(one.sensors)) for one in designs]
+    sensors = tables[0][1] if len(tables) == 1 else "".join(folded(*one) for one in tables)
     return [
         ("result", "Result", result_section(evaluation, designs)),
+        ("sensors", "Sensors", sensors),
         ("scene", "Designs in a scene", view_section(report.shown, shown, report.density_m)),
         ("scores", "Scores", _scores(evaluation)),
         ("mounting", "Mounted carelessly", mounting_table(evaluation)),
@@ -189,7 +191,6 @@ def _parts(report: Report) -> list[tuple[str, str, str]]:
         ("physics", "Physics", effects_section(evaluation) if evaluation.effects else ""),
         ("audit", "Audit of the physics", audit_section(evaluation, evaluation.audit) if evaluation.audit else ""),
         ("accuracy", "What accuracy costs", _accuracy(evaluation.accuracy.sweeps if evaluation.accuracy else ())),
-        ("sensors", "Sensors", sensors),
         ("time", "Where the time went", times_tables(report.times)),
         ("reproduce", "How to reproduce this", reproduction(report.reproduce)),
     ]
@@ -203,12 +204,12 @@ def result_section(evaluation: Evaluation, designs: Sequence[DesignSpec]) -> str
         designs: The designs, whose chosen rays may have certificates.
     """
     rows, pairs = evaluation.headline_rows, evaluation.headline_pairs
-    said = [headline(evaluation, pairs[name]) for name in rows if name in pairs]
+    said = [f"{text}." for text in headline_texts(evaluation)]
     if not said:
         unit = evaluation.metric.unit
         said = [f"{row.design}: {_figures(row.value, row)[0]} {unit} at {row.rays} rays." for row in rows.values()]
-    # a long list says less than the table below it
-    said = said if len(said) <= MOST_SENTENCES else []
+        # a long list says less than the table below it
+        said = said if len(said) <= MOST_SENTENCES else []
     notes = [paragraphs([note], "note") for note in evaluation.notes]
     further = folded("Further notes", "".join(notes[MOST_NOTES:]), len(notes) - MOST_NOTES)
     return (
@@ -220,27 +221,22 @@ def result_section(evaluation: Evaluation, designs: Sequence[DesignSpec]) -> str
     )
 
 
-def headline(evaluation: Evaluation, pair: Paired) -> str:
-    """A sentence about a pair: the better one and by how much, or that no difference was found."""
-    text = difference_text(pair, evaluation.metric.better, evaluation.metric.unit)
-    return f"{text.replace('no difference', 'No difference', 1) if text.startswith('no difference') else text}."
-
-
 def _table(evaluation: Evaluation, rows: dict[str, Row], pairs: dict[str, Paired]) -> str:
     metric, baseline = evaluation.metric, evaluation.strongest_baseline
     shown = [*rows.values(), *evaluation.baseline_rows]
-    headings = ["design", "rays", f"{metric.name} [{metric.unit}]", "95 % interval", "Mbit/s"]
+    headings = ["design", "rays", f"{metric.name} [{metric.unit}]", "95 % interval", "gates", "Mbit/s"]
     if baseline is not None:
         headings += [f"difference to {baseline.name}", "design is"]
     lines = []
     for row in shown:
         value, value_interval = _figures(row.value, row)
-        cells = [row.design, str(row.rays), value, value_interval, f"{row.bandwidth_mbps:.3g}"]
+        cells = [row.design, str(row.rays), value, value_interval, str(row.gates), f"{row.bandwidth_mbps:.3g}"]
         pair = pairs.get(row.design)
         if baseline is not None:
             cells += ["", ""] if pair is None else ["{} ({})".format(*_figures(pair.difference, pair, sign="+")), ""]
         lines.append((cells, "" if pair is None else verdict(evaluation, pair), row.baseline))
-    return table(headings, lines, text_columns=1, caption="Designs, and the strongest baseline on training scenes.")
+    caption = "Designs, what one would place by hand (uniform, bounding), and the strongest baseline."
+    return table(headings, lines, text_columns=1, caption=caption)
 
 
 def _about(evaluation: Evaluation) -> list[str]:
@@ -264,11 +260,13 @@ def _certificates(evaluation: Evaluation, designs: Sequence[DesignSpec]) -> list
         f"{100 * entry['gap']:.1f} % ({design.name})"
         for design in designs
         for entry in certificates_of(design)
-        if design.name in rows and entry["rays"] == rows[design.name].rays
+        if design.name in rows and entry["rays"] == rows[design.name].rays and entry["gap"] <= MOST_GAP
     ]
     if not gaps:
         return []
-    said = "Certificate: no other choice of as many of the same candidates lowers the loss on training scenes by more"
+    said = (
+        "Certificate: on the training scenes, no other choice of as many of the same candidates could be better by more"
+    )
     return [f"{said} than {', '.join(gaps)}."]
 
 

@@ -13,7 +13,7 @@ from lidardesign.scoring.evaluation.results import Evaluation, Row
 Against = Literal["rays", "bandwidth"]
 
 # The words of the report.
-VERDICT_WORDS = {"better": "better", "worse": "worse", "open": "no difference found"}
+VERDICT_WORDS = {"better": "better", "worse": "worse", "open": "no significant difference"}
 OUTCOME_WORDS = {
     Outcome.RETURN: "return",
     Outcome.OCCLUDED: "occluded",

@@ -208,6 +208,10 @@ class DesignSpec:
 CERTIFIED = ("rays", "value", "bound", "gap", "held_back_value", "candidates", "gates", "scenes")
 
 
+# A bound that leaves more of the loss open than this certifies nothing that anyone would act on.
+MOST_GAP = 0.5
+
+
 def certificates_of(design: DesignSpec) -> list[dict[str, Any]]:
     """The certificates of a design's choices of rays, one per number of rays, without damaged entries."""
     return [entry for entry in design.certificates if all(type(entry.get(name)) in (int, float) for name in CERTIFIED)]

@@ -71,6 +71,22 @@ def test_the_script_of_users_runs_as_it_stands(tmp_path, monkeypatch):
     assert not (tmp_path / "runs" / "face" / "designs" / "free.yaml").exists()
 
 
+@pytest.mark.parametrize("name", ["uniform", "bounding", "greedy"])
+def test_a_baseline_that_is_saved_scores_as_the_baseline_does(run, name):
+    design = run.save_baseline(name, rays=16)
+    assert design.path == run.design_path(f"{name}-rays")
+    (own, row) = (row for row in run.evaluate([design], rays=[16]).rows if row.design in (name, f"{name}-rays"))
+    np.testing.assert_allclose(own.per_scene, row.per_scene, rtol=1e-12)
+    assert own.gates == row.gates
+
+
+@pytest.mark.parametrize(("name", "said"), [("random", "no fixed list"), ("cma", "no fixed list"), ("x", "unknown")])
+def test_a_baseline_without_rays_of_its_own_is_not_saved(run, name, said):
+    with pytest.raises(ConfigError, match=said) as refused:
+        run.save_baseline(name)
+    assert "greedy" in str(refused.value.allowed)
+
+
 @pytest.mark.parametrize("name", NOUNS)
 def test_every_noun_has_an_example_that_runs(run, name):
     noun = getattr(lidardesign, name)

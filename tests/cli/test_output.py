@@ -11,9 +11,7 @@ from support.command_line import caller
 from lidardesign.cli.terminal import grids as progress
 from lidardesign.cli.terminal.grids import ProgressDisplay
 from lidardesign.cli.terminal.output import Output
-from lidardesign.cli.terminal.score_tables import sentence
 from lidardesign.errors import BackgroundNote
-from lidardesign.scoring.evaluation.results import Paired
 
 
 @pytest.fixture
@@ -49,27 +47,6 @@ def test_a_fit_prints_a_line_per_sensor_and_what_limits_it(lidardesign, flat):
     loud = lidardesign(f"{fit} -v").out
     assert all(words in loud for words in ("bound", "log-likelihood", "where the time went"))
     assert json.loads(lidardesign(f"{fit} --json").out)["design"] == "run/designs/thin.yaml"
-
-
-def pair(name, low, high):
-    return Paired(name, "greedy", 20, (low + high) / 2, low, high)
-
-
-END = "; greedy is the strongest baseline on training scenes"
-
-
-@pytest.mark.parametrize(
-    ("pairs", "better", "said"),
-    [
-        ([pair("fit", -3, -1)], "lower", f"fit is better than greedy by 2.0 mm (1.0 to 3.0) at 20 rays{END}"),
-        ([pair("a", -3, -1), pair("b", -2, -1), pair("c", -1, 1)], "lower",
-         "against greedy, the strongest baseline on training scenes: a and b are better; "
-         "no difference was found for c"),
-    ],
-)  # fmt: skip
-def test_a_sentence_says_what_designs_are_against_the_strongest_baseline(pairs, better, said):
-    evaluation = SimpleNamespace(metric=SimpleNamespace(unit="mm", better=better))
-    assert sentence(evaluation, pairs) == said
 
 
 def lines_of_work(monkeypatch, seconds, steps=5000):

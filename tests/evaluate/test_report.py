@@ -152,6 +152,29 @@ def test_plotly_accepts_every_figure():
     assert all(go.Figure(one).data for one in figures)
 
 
+def test_one_number_of_rays_is_bars_and_shares_are_on_a_linear_axis():
+    evaluation = make_report().evaluation
+    one = replace(evaluation, rows=[row for row in evaluation.rows if row.rays == evaluation.rows[0].rays])
+    bars = curve_figure(one, "rays")
+    assert {trace["type"] for trace in bars["data"]} == {"bar"}
+    assert bars["layout"]["yaxis"]["type"] == "linear"
+    drawn = [(trace["x"][0], trace["y"][0]) for trace in bars["data"] if trace["x"]]
+    assert drawn == [(curve.name, curve.rows[0].value) for curve in series(one)]
+    assert len(bars["data"]) == 2 * len(drawn)  # a switch turns both of a curve
+    assert go.Figure(bars).data
+    assert {trace["type"] for trace in curve_figure(one, "bandwidth")["data"]} == {"scatter"}
+    wide = replace(evaluation, rows=[replace(row, value=row.value * 40**n) for n, row in enumerate(evaluation.rows)])
+    for unit, kind in (("mm", "log"), ("%", "linear")):
+        shown = replace(wide, metric=replace(wide.metric, unit=unit))
+        assert curve_figure(shown, "rays")["layout"]["yaxis"]["type"] == kind
+
+
+def test_a_baseline_that_was_asked_for_is_not_hidden():
+    evaluation = replace(make_evaluation("plain"), named=("uniform",))
+    assert far_baselines(evaluation) == set()
+    assert "uniform" in {row.design for row in evaluation.baseline_rows}
+
+
 def test_bars_of_constraints_are_full_at_the_bound_and_half_in_the_middle():
     report = make_report()
     (tight,) = report.constraints["plain"]

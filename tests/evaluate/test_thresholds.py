@@ -10,9 +10,10 @@ from support.evaluations import METRIC, make_row
 from support.scoring import HitTask, design, make_request
 
 from lidardesign.errors import ThresholdError
+from lidardesign.scoring.evaluation.entries import StrongestBaseline
 from lidardesign.scoring.evaluation.results import Evaluation, Paired, verdict
 from lidardesign.scoring.evaluation.score import evaluate
-from lidardesign.scoring.evaluation.thresholds import check_better, check_limit, difference_text
+from lidardesign.scoring.evaluation.thresholds import check_better, check_limit, difference_text, headline_texts
 
 
 @pytest.mark.parametrize(
@@ -24,22 +25,54 @@ from lidardesign.scoring.evaluation.thresholds import check_better, check_limit,
         (
             "lower",
             (0.05, -0.07, 0.16),
-            "no difference between f3 and greedy was found at 361 rays (0.05 mm worse, -0.07 to 0.16)",
+            "f3 is not significantly different from greedy (0.05 mm worse, -0.07 to 0.16) at 361 rays",
         ),
         (
             "higher",
             (0.05, -0.07, 0.16),
-            "no difference between f3 and greedy was found at 361 rays (0.05 mm better, -0.07 to 0.16)",
+            "f3 is not significantly different from greedy (0.05 mm better, -0.07 to 0.16) at 361 rays",
         ),
         (
             "lower",
             (-0.5, None, None),
-            "no difference between f3 and greedy was found at 361 rays (0.5 mm better)",
+            "f3 is not significantly different from greedy (0.5 mm better) at 361 rays",
         ),
     ],
 )
 def test_a_difference_is_told_in_one_sentence(better, difference, told):
     assert difference_text(Paired("f3", "greedy", 361, *difference), better, "mm") == told
+
+
+def headlines(better, values, gates=9, strongest="greedy"):
+    """Headlines of designs with such scores; differences to baselines are exact."""
+    scores = {"uniform": 20.0, "bounding": 7.0, "greedy": 5.0}
+    rows = [make_row(name, 36, value) for name, value in values.items()]
+    rows += [replace(make_row(name, 36, value, True), gates=gates) for name, value in scores.items()]
+    pairs = [
+        Paired(name, other, 36, value - worth, value - worth - 0.5, value - worth + 0.5)
+        for name, value in values.items()
+        for other, worth in scores.items()
+    ]
+    best = StrongestBaseline(strongest, 36, 20, scores)
+    return headline_texts(Evaluation(replace(METRIC, better=better), 5, rows, pairs, strongest_baseline=best))
+
+
+def test_the_best_design_comes_first_beside_what_one_would_place_by_hand():
+    assert headlines("lower", {"f": 6.0}) == [
+        "f is better than uniform by 14.00 mm (13.50 to 14.50) and better than bounding by 1.00 mm (0.50 to 1.50) "
+        "at 36 rays",
+        "The strongest baseline on training scenes is greedy (any rays, 9 gates): f is worse than greedy by 1.00 mm "
+        "(0.50 to 1.50)",
+    ]
+    several = headlines("lower", {"f": 6.0, "g": 5.2, "h": 4.0}, gates=1)
+    assert several[0].startswith("h, the best design, is better than uniform by 16.00 mm")
+    assert "greedy (no more gates): h is better" in several[1]
+    assert several[2:] == ["Against greedy: h is better; f is worse; g: no significant difference"]
+    assert headlines("higher", {"f": 6.0, "g": 8.0})[0].startswith("g, the best design, is worse than uniform")
+
+
+def test_a_strongest_baseline_that_was_compared_with_is_not_told_again():
+    assert len(headlines("lower", {"f": 6.0}, strongest="bounding")) == 1
 
 
 def evaluation_of(pairs, better="lower", names=("f3", "f4"), rays=(196, 361)):
@@ -66,7 +99,7 @@ def test_designs_must_be_better_at_every_number_of_rays(kinds, better):
     with pytest.raises(ThresholdError) as refused:
         check_better(evaluation, "greedy")
     said = {
-        OPEN: "no difference between f3 and greedy was found at 361 rays (0.10 mm better, -0.10 to 0.30)",
+        OPEN: "f3 is not significantly different from greedy (0.10 mm better, -0.10 to 0.30) at 361 rays",
         WORSE: "f3 is worse than greedy by 0.60 mm (0.30 to 0.90) at 196 rays",
         None: "greedy has no score at 361 rays to compare f3 with",
     }

@@ -32,6 +32,9 @@ def fit(
     at: options.At = None,
     weights: options.Weights = None,
     parts: options.Parts = None,
+    modules: options.Modules = None,
+    fov: options.ModuleField = None,
+    zones: options.ModuleZones = None,
     like: options.Like = None,
     name: options.Name = "fit",
     seed: options.Seed = None,
@@ -54,8 +57,9 @@ def fit(
             from lidardesign.fitting.request import FitRequest
             from lidardesign.run_folder import RunFolder
 
+        names, count = options.part_names(parts, modules, fov, zones, sensors)
         chosen = FitOptions(
-            sensors=options.sensor_count(sensors),
+            sensors=count,
             layout=layout,
             rays=rays,
             channels=channels,
@@ -63,7 +67,7 @@ def fit(
             level=level,
             at=options.parse_at(at),
             weights=weights or (),
-            parts=options.part_names(parts),
+            parts=names,
             like=like,
             name=name,
             seed=seed,
@@ -134,6 +138,9 @@ def constrain(
     at: options.At = None,
     weights: options.Weights = None,
     parts: options.Parts = None,
+    modules: options.Modules = None,
+    fov: options.ModuleField = None,
+    zones: options.ModuleZones = None,
     like: options.Like = None,
     name: options.Name = "constrained",
     seed: options.Seed = None,
@@ -159,8 +166,9 @@ def constrain(
         opened, design = open_target(target, output.remark)
         run = need_run(opened, target)
         bounds, settings = split_settings(overrides or (), run.task)
+        names, count = options.part_names(parts, modules, fov, zones, sensors)
         chosen = FitOptions(
-            sensors=options.sensor_count(sensors),
+            sensors=count,
             constraints=load_constraints(constraints, bounds, output.remark) or Constraints(),
             layout=layout,
             rays=rays,
@@ -169,7 +177,7 @@ def constrain(
             level=level,
             at=options.parse_at(at),
             weights=weights or (),
-            parts=options.part_names(parts),
+            parts=names,
             like=like,
             name=name,
             seed=seed,

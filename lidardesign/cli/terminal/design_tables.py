@@ -213,17 +213,16 @@ def _frames(design: DesignSpec) -> str:
 
 def _show_choice(design: DesignSpec, rich: RichConsole) -> None:
     """Print the numbers of candidates and scenes of a choice, its loss and the lower bound of the loss."""
-    from lidardesign.sensors.design import certificates_of
+    from lidardesign.sensors.design import MOST_GAP, certificates_of
 
     entries = certificates_of(design)
     if entries:
         last, are_parts = entries[-1], all(sensor.part is not None for sensor in design.sensors)
         what, count = ("poses of parts", len(design.sensors)) if are_parts else ("rays", last["rays"])
-        rich.print(
-            f"chosen among {last['candidates']} {what} on {last['scenes']} training scenes; these {count} have a loss "
-            f"of {last['value']:.3g}, any others of at least {last['bound']:.3g} ({100 * last['gap']:.1f} % less)",
-            soft_wrap=True,
-        )
+        text = f"chosen among {last['candidates']} {what} on {last['scenes']} training scenes"
+        if last["gap"] <= MOST_GAP:
+            text += f"; no other choice of {count} could be more than {100 * last['gap']:.1f} % better there"
+        rich.print(text, soft_wrap=True)
 
 
 def _tight(checks: Sequence[ConstraintCheck], sensors: Sequence[str]) -> str:

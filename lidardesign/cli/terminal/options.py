@@ -167,6 +167,16 @@ Parts = Annotated[
         show_default=False,
     ),
 ]
+Modules = Annotated[
+    int | None,
+    typer.Option("--modules", metavar="N", help="So many modules with --fov and --zones.", show_default=False),
+]
+ModuleField = Annotated[
+    str | None, typer.Option("--fov", metavar="WxH", help="Of modules, degrees, as 45x45.", show_default=False)
+]
+ModuleZones = Annotated[
+    str | None, typer.Option("--zones", metavar="CxR", help="Of modules, as 8x8.", show_default=False)
+]
 Judge = Annotated[
     str | None,
     typer.Option(
@@ -305,16 +315,23 @@ def sensor_count(text: str | None) -> int | str | None:
     return int(text) if text is not None and re.fullmatch("[0-9]{1,9}", text) else text
 
 
-def part_names(text: str | None) -> list[str] | str | None:
-    """The value of `--parts`: names, or `catalog` for all parts that are shipped.
+def part_names(
+    parts: str | None, modules: int | None, fov: str | None, zones: str | None, sensors: str | None
+) -> tuple[list[str] | str | None, int | str | None]:
+    """The parts that are named, `catalog` for all that are shipped, or modules; and the number of sensors.
 
     Raises:
-        ConfigError: A name is empty.
+        ConfigError: A name is empty, or a module lacks something.
     """
-    names = [] if text is None else [name.strip() for name in text.split(",")]
-    if not all(names):
-        raise ConfigError(f"{text!r} has an empty part name", where="--parts", allowed="NAME,NAME or catalog")
-    return text if text in (None, "catalog") else names
+    if (modules, fov, zones) == (None, None, None):
+        names = [] if parts is None else [name.strip() for name in parts.split(",")]
+        if not all(names):
+            raise ConfigError(f"{parts!r} has an empty part name", where="--parts", allowed="NAME,NAME or catalog")
+        return (parts if parts in (None, "catalog") else names), sensor_count(sensors)
+    if None in (modules, fov, zones) or (parts, sensors) != (None, None):
+        allowed = "--modules N --fov WxH --zones CxR, without --sensors and --parts"
+        raise ConfigError("this is no whole description of modules", where="--modules", allowed=allowed)
+    return [f"module-{fov}-{zones}"], modules
 
 
 class StrictCommand(TyperCommand):

@@ -11,7 +11,7 @@ from lidardesign.cli.terminal.grids import RichConsole, difference_cell, duratio
 from lidardesign.run.clock import INSIDE, OTHER
 
 if TYPE_CHECKING:
-    from lidardesign.scoring.evaluation.results import Evaluation, Paired
+    from lidardesign.scoring.evaluation.results import Evaluation
     from lidardesign.scoring.sweep import Accuracy, Measurement, Sweep
 
 
@@ -36,8 +36,8 @@ def show_evaluation(document: Entry, evaluation: Evaluation, rich: RichConsole, 
 
 
 def _show_designs(document: Entry, evaluation: Evaluation, rich: RichConsole) -> None:
-    """Print a row per design with its difference to the strongest baseline, and a line on each further result."""
-    from lidardesign.scoring.evaluation.thresholds import difference_text
+    """Print a row per design and baseline of `baseline_rows`, and a line on each further result."""
+    from lidardesign.scoring.evaluation.thresholds import difference_text, headline_texts
 
     rows, pairs = evaluation.headline_rows, evaluation.headline_pairs
     baseline = evaluation.strongest_baseline
@@ -48,6 +48,7 @@ def _show_designs(document: Entry, evaluation: Evaluation, rich: RichConsole) ->
         "value": values,
         "95 % interval": intervals,
         "failures": [str(row["failures"]) for row in shown],
+        "gates": [str(row["gates"]) for row in shown],
         "Mbit/s": [number(row["bandwidth_mbps"], 3) for row in shown],
     }
     if any("lost" in row for row in shown):
@@ -66,9 +67,9 @@ def _show_designs(document: Entry, evaluation: Evaluation, rich: RichConsole) ->
     others = sorted({row.rays for row in evaluation.rows} - counts)
     rich.print(f"{title}; -v: {', '.join(map(str, others))} rays too" if others else title, soft_wrap=True)
     print_table(None, ("design", *columns), list(zip(names, *columns.values(), strict=True)), rich)
-    if pairs:
-        rich.print(sentence(evaluation, list(pairs.values())), soft_wrap=True)
-    elif baseline is None:
+    for text in headline_texts(evaluation):
+        rich.print(text, soft_wrap=True)
+    if baseline is None:
         for pair in evaluation.paired:
             if pair.rays == rows[pair.a].rays:
                 rich.print(difference_text(pair, metric.better, metric.unit), soft_wrap=True)
@@ -79,24 +80,6 @@ def _show_designs(document: Entry, evaluation: Evaluation, rich: RichConsole) ->
     simulated = [_words(effect["name"]) for effect in document["effects"] if effect["on"]]
     if simulated:
         rich.print(f"effects with the detector {document['detector']}: {', '.join(simulated)}", soft_wrap=True)
-
-
-def sentence(evaluation: Evaluation, pairs: Sequence[Paired]) -> str:
-    """A sentence that compares designs with the strongest baseline."""
-    from lidardesign.scoring.evaluation.results import verdict
-    from lidardesign.scoring.evaluation.thresholds import difference_text
-
-    metric, baseline = evaluation.metric, pairs[0].b
-    if len(pairs) == 1:
-        apart = difference_text(pairs[0], metric.better, metric.unit)
-        return f"{apart}; {baseline} is the strongest baseline on training scenes"
-    parts = []
-    for word in ("better", "worse", "open"):
-        names = [pair.a for pair in pairs if verdict(evaluation, pair) == word]
-        listed = " and ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))
-        is_word = f"{listed} {'are' if len(names) > 1 else 'is'} {word}"
-        parts += [f"no difference was found for {listed}" if word == "open" else is_word] * bool(names)
-    return f"against {baseline}, the strongest baseline on training scenes: {'; '.join(parts)}"
 
 
 def _scenes(document: Entry) -> str:

@@ -74,6 +74,11 @@ class Entry:
         """Rays per condition value."""
         return len(self.positions[0])
 
+    @property
+    def gates(self) -> int:
+        """Different gates of its sensors, at the condition value where they are most."""
+        return max(len(np.unique(np.column_stack([rays.sensor, rays.gate_m]), axis=0)) for rays in self.positions)
+
     def mbps(self, bandwidth: Bandwidth) -> float:
         """The bandwidth of its rays, averaged over condition values [Mbit/s]."""
         return mean_mbps(self.positions, bandwidth)

@@ -63,6 +63,7 @@ class EvaluationRequest:
         starmap: How held-out scenes are scored: in this process, or by workers, to the same numbers.
         scenes_seed: Root of the held-out scenes; None: `seed`.
         alone: Those numbers of rays at which fixed patterns are evaluated without baselines and other designs.
+        named: Baselines that were asked for, which summaries show.
     """
 
     task: Task
@@ -87,6 +88,7 @@ class EvaluationRequest:
     starmap: Starmap = itertools.starmap
     scenes_seed: int | None = None
     alone: Sequence[int] = ()
+    named: Sequence[str] = ()
 
     @property
     def held_out_seed(self) -> int:

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from lidardesign.scoring.baselines.cma import SearchRecord
     from lidardesign.scoring.evaluation.entries import StrongestBaseline
 
+# What one would place without a design: a grid over everything, and one cropped to what returns.
+BY_HAND = ("uniform", "bounding")
 ROW_KEYS = (
     "design", "rays", "value", "ci_low", "ci_high", "half_width", "worst_decile", "failures", "bandwidth_mbps",
     "seconds",
@@ -71,6 +73,7 @@ class Row(_WithInterval):
         worst_decile: The mean score in the worst tenth of the scenes.
         lost: The mean score with each of the design's sensors lost, where that was asked for.
         better: lower or higher, as of the metric.
+        gates: Different gates of its sensors.
     """
 
     design: str
@@ -91,6 +94,7 @@ class Row(_WithInterval):
     worst_decile: float | None = None
     lost: tuple[float, ...] = ()
     better: str = "lower"
+    gates: int = 1
 
     @property
     def worst_lost(self) -> float | None:
@@ -104,7 +108,7 @@ class Row(_WithInterval):
 
     def as_dict(self) -> dict[str, Any]:
         """The contract's keys, `half_width`, `details`, and at equal bandwidth the design that it was matched to."""
-        values = {name: getattr(self, name) for name in ROW_KEYS} | {"details": dict(self.details)}
+        values = {name: getattr(self, name) for name in (*ROW_KEYS, "gates")} | {"details": dict(self.details)}
         if self.matched_to is not None:
             values |= {"matched_to": self.matched_to, "matched_rays": self.matched_rays}
         if self.per_seed:
@@ -204,6 +208,7 @@ class Evaluation:
         searches: The searches of the baseline `cma`, where it was asked for.
         seeds: Of learning and fitting, where rows and differences are means over several.
         strongest_baseline: The best baseline at `middle_rays` on training scenes; None where no baseline was scored.
+        named: Baselines that were asked for.
     """
 
     metric: Metric
@@ -222,6 +227,7 @@ class Evaluation:
     searches: Sequence[SearchRecord] = ()
     seeds: Sequence[int] = ()
     strongest_baseline: StrongestBaseline | None = None
+    named: Sequence[str] = ()
 
     @property
     def middle_rays(self) -> int:
@@ -243,10 +249,18 @@ class Evaluation:
         return {pair.a: pair for pair in against if pair.rays == counts[pair.a]}
 
     @property
+    def best_row(self) -> Row:
+        """The best of the rows in `headline_rows`: at the middle number of rays, where any design has that."""
+        rows = list(self.headline_rows.values())
+        usual = [row for row in rows if row.rays == self.middle_rays] or rows
+        return (min if self.metric.better == "lower" else max)(usual, key=lambda row: row.value)
+
+    @property
     def baseline_rows(self) -> list[Row]:
-        """The strongest baseline's rows at the numbers of rays of `headline_rows`; empty where none was scored."""
-        baseline, counts = self.strongest_baseline, {row.rays for row in self.headline_rows.values()}
-        return [row for row in self.rows if baseline and row.design == baseline.name and row.rays in counts]
+        """What stands for layouts by hand, the strongest baseline, and those asked for, at `headline_rows`' rays."""
+        strongest = () if self.strongest_baseline is None else (self.strongest_baseline.name,)
+        names, counts = {*BY_HAND, *strongest, *self.named}, {row.rays for row in self.headline_rows.values()}
+        return [row for row in self.rows if row.baseline and row.design in names and row.rays in counts]
 
     @property
     def groups(self) -> int:

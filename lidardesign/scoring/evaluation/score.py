@@ -103,6 +103,7 @@ def evaluate(request: EvaluationRequest, progress: Progress | None = None) -> Ev
         mounting=mounting,
         searches=searches,
         strongest_baseline=strongest_baseline(request, entries, middle_rays(plain)),
+        named=request.named,
     )
 
 
@@ -229,6 +230,7 @@ def _row(request: EvaluationRequest, entry: Entry, scores: Sequence[tuple[Score,
         groups=groups,
         worst_decile=worst_tenth(values, request.metric.better),
         better=request.metric.better,
+        gates=entry.gates,
     )
 
 

@@ -165,6 +165,7 @@ def _mean_row(rows: Sequence[Row], metric: Metric) -> Row:
         seconds=sum(row.seconds for row in rows),
         per_scene=values.mean(axis=0),
         details={name: float(np.mean([row.details[name] for row in rows])) for name in names},
+        gates=max(row.gates for row in rows),
         per_seed=tuple(values.mean(axis=1).tolist()),
         worst_decile=None if None in deciles else float(np.mean(deciles)),
         # which sensor is the first says nothing over seeds: from the least score to the largest

@@ -9,11 +9,11 @@ from dataclasses import replace
 
 from lidardesign.errors import ThresholdError
 from lidardesign.estimates import figure_and_interval
-from lidardesign.scoring.evaluation.results import Evaluation, Paired, Row, verdict
+from lidardesign.scoring.evaluation.results import BY_HAND, Evaluation, Paired, Row, verdict
 
 
-def difference_text(pair: Paired, better: str, unit: str) -> str:
-    """A difference as a sentence: who is better by how much, or that no difference was found.
+def comparison(pair: Paired, better: str, unit: str) -> str:
+    """What the first of a pair is beside the second: better or worse by how much, or not significantly different.
 
     Arguments:
         pair: The difference.
@@ -27,13 +27,53 @@ def difference_text(pair: Paired, better: str, unit: str) -> str:
     unit = "percentage points" if unit == "%" else unit
     size, low_text, high_text = figure_and_interval(abs(pair.difference), low, high)
     by = f"{size} {unit}".rstrip()
-    rays = f"at {pair.rays} rays" if pair.rays_b in (None, pair.rays) else f"at {pair.rays} and {pair.rays_b} rays"
-    none = f"no difference between {pair.a} and {pair.b} was found {rays}"
     if low is None:
-        return f"{none} ({by} {word})"
+        return f"not significantly different from {pair.b} ({by} {word})"
     if low > 0:
-        return f"{pair.a} is {word} than {pair.b} by {by} ({low_text} to {high_text}) {rays}"
-    return f"{none} ({by} {word}, {low_text} to {high_text})"
+        return f"{word} than {pair.b} by {by} ({low_text} to {high_text})"
+    return f"not significantly different from {pair.b} ({by} {word}, {low_text} to {high_text})"
+
+
+def difference_text(pair: Paired, better: str, unit: str) -> str:
+    """A difference as a sentence; arguments as of `comparison`."""
+    rays = f"at {pair.rays} rays" if pair.rays_b in (None, pair.rays) else f"at {pair.rays} and {pair.rays_b} rays"
+    return f"{pair.a} is {comparison(pair, better, unit)} {rays}"
+
+
+def headline_texts(evaluation: Evaluation) -> list[str]:
+    """The best design against what one would place by hand, then against the strongest baseline; all against that one.
+
+    Empty without baselines.
+    """
+    rows, metric, strongest = evaluation.headline_rows, evaluation.metric, evaluation.strongest_baseline
+    if strongest is None or not evaluation.headline_pairs:
+        return []
+    best = evaluation.best_row
+    pairs = {pair.b: pair for pair in evaluation.paired if (pair.a, pair.rays) == (best.design, best.rays)}
+    plain = [comparison(pairs[name], metric.better, metric.unit) for name in BY_HAND if name in pairs]
+    name = best.design if len(rows) == 1 else f"{best.design}, the best design,"
+    said = [f"{name} is {' and '.join(plain)} at {best.rays} rays"] if plain else []
+    if strongest.name not in BY_HAND and strongest.name in pairs:
+        its = next(row for row in evaluation.rows if (row.design, row.rays) == (strongest.name, best.rays))
+        may = f"any rays, {its.gates} gates" if its.gates > best.gates else "no more gates"
+        against = comparison(pairs[strongest.name], metric.better, metric.unit)
+        said.append(
+            f"The strongest baseline on training scenes is {strongest.name} ({may}): {best.design} is {against}"
+        )
+    if len(rows) > 1:
+        said.append(f"Against {strongest.name}: {_verdicts(evaluation)}")
+    return said
+
+
+def _verdicts(evaluation: Evaluation) -> str:
+    """Which designs are better and worse than the strongest baseline, and which neither."""
+    pairs, parts = list(evaluation.headline_pairs.values()), []
+    for word in ("better", "worse", "open"):
+        names = [pair.a for pair in pairs if verdict(evaluation, pair) == word]
+        listed = " and ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))
+        verb = "are" if len(names) > 1 else "is"
+        parts += [f"{listed}: no significant difference" if word == "open" else f"{listed} {verb} {word}"] * bool(names)
+    return "; ".join(parts)
 
 
 def worse_than_threshold(evaluation: Evaluation, limit: float) -> list[Row]:
