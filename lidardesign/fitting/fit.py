@@ -13,12 +13,15 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
+from shlex import quote
 from typing import TYPE_CHECKING
 
-from lidardesign.config import with_task_settings
+import numpy as np
+
+from lidardesign.config import FILE_NAME, with_task_settings
 from lidardesign.constraints.check import ConstraintCheck, check_design
 from lidardesign.constraints.document import Constraints, merged
 from lidardesign.constraints.feasibility import check_feasible
@@ -40,6 +43,7 @@ from lidardesign.run_folder import Notes, RunFolder, ignore, log_note
 from lidardesign.samples import Samples, load_samples
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import design_document
+from lidardesign.space import DIMENSIONS
 from lidardesign.task import mount_of, random_generator
 from lidardesign.workers import Starmap
 
@@ -83,7 +87,12 @@ def fit_design(
         InfeasibleError: Constraints that contradict each other, or that the design does not keep.
     """
     fitter = Fitter(request, notes, progress, starmap, samples, target)
-    result = fitter.fit()
+    try:
+        result = fitter.fit()
+    except InfeasibleError as error:
+        error.hint = _wider_run(request, error.conflicts) or error.hint
+        error.args = (error.render(),)
+        raise
     for note in result.notes:
         notes(note)
     # of a goal it is found
@@ -106,6 +115,26 @@ def fit_design(
     design = replace(design, mount=mount, provenance={**design.provenance, **origin, **weighting, **world})
     with phase("writing"):
         return replace(result, design=design, constraints=check_written(design, request))
+
+
+def _wider_run(request: FitRequest, conflicts: Sequence[str]) -> str | None:
+    """The command that learns a run with room for the places of constraints; None where those are no conflict."""
+    names = [f"space.{name}" for name in DIMENSIONS[:3]]
+    if not {*names} & {*conflicts}:
+        return None
+    run = request.run
+    origins = [rules.origin for rules in request.constraints.rules]
+    singles = [place for one in origins for place in (one.fixed_m, one.low_m, one.high_m) if place is not None]
+    places = np.array([*singles, *(place for one in origins for place in one.mounts_m or ())]).reshape(-1, 3)
+    ends = np.stack([run.config.space.low[:3], run.config.space.high[:3]])
+    wider = np.stack([np.minimum(ends[0], places.min(axis=0)), np.maximum(ends[1], places.max(axis=0))])
+    grown = [axis for axis in range(3) if (wider != ends)[:, axis].any()]
+    if not grown:
+        return None
+    folder = str(run.folder)
+    settings = " ".join(f"--set '{names[axis]}=[{wider[0, axis]:g}, {wider[1, axis]:g}]'" for axis in grown)
+    command = f"lidardesign learn {run.task.name} --config {quote(f'{folder}/{FILE_NAME}')} {settings}"
+    return f"loosen the constraint, or learn a run with room for it: {command} --out {quote(f'{folder}-wide')}"
 
 
 def check_written(design: DesignSpec, request: FitRequest) -> tuple[ConstraintCheck, ...]:

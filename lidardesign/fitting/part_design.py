@@ -140,7 +140,8 @@ def choose_parts(
     winner = min(found, key=lambda one: sign * one.scores[: min(len(one.scores) for one in found)].sum())
     if len(winner.members) < count and not request.fewest:
         notes(f"{len(winner.members)} of {count} parts: no further part tells more or fits the bounds")
-    for line in (*_price_notes([placed[member].part for member in winner.members]), *reach_notes(winner.design)):
+    parts = [placed[member].part for member in winner.members]
+    for line in (*_price_notes(parts), *_place_notes(winner.design), *reach_notes(winner.design)):
         notes(line)
     told = part_table(inform(training.first(HELD_BACK), among=winner.members), len(winner.members))
     certificate = certificate_document(
@@ -188,6 +189,17 @@ def _sets_by_number(
             with suppress(InfeasibleError):  # fewer rays than are asked for
                 by_number[-1].append(trial(members, best.bound))
     return by_number
+
+
+def _place_notes(design: DesignSpec) -> list[str]:
+    """A line on parts that stand at one place."""
+    here: dict[tuple[float, ...], list[str]] = {}
+    for sensor in design.sensors:
+        here.setdefault(tuple(np.round(sensor.origin_m, 3).tolist()), []).append(sensor.name)
+    several = [" and ".join(names) for names in here.values() if len(names) > 1]
+    if not several:
+        return []
+    return [f"{'; '.join(several)} stand at one place: one mount for several, or list places in origin.mounts_m"]
 
 
 def _price_notes(parts: Sequence[Part]) -> list[str]:

@@ -105,7 +105,7 @@ class PartFieldOfView(Statement):
         return self
 
 
-class Mounting(Statement):
+class MountingStatement(Statement):
     """How a part is mounted; what no source says is left out.
 
     Arguments:
@@ -233,7 +233,7 @@ class Figures(_Keys):
     points_per_s: Values | None = None
     power_w: Values | None = None
     price: Values | None = None
-    mounting: Annotated[list[Mounting], Field(min_length=1)] | None = None
+    mounting: Annotated[list[MountingStatement], Field(min_length=1)] | None = None
 
 
 FIELDS = tuple(Figures.model_fields)

@@ -13,9 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from lidardesign.report.figures import AXIS, LAYOUT
+from lidardesign.report.figures import AXIS, LAYOUT, Series
 from lidardesign.report.markup import figure, folded, paragraphs, swatch
-from lidardesign.report.series import Series
 from lidardesign.report.tables import four_digits, table
 from lidardesign.scoring.evaluation.results import Evaluation
 from lidardesign.sensors.design import DesignSpec, certificates_of

@@ -5,12 +5,15 @@ Everything that comes from outside is escaped here or where it is put in.
 
 from __future__ import annotations
 
+import base64
 import html
 import json
 import re
 from collections.abc import Sequence
 from importlib.resources import files
 from typing import Any
+
+import numpy as np
 
 STROKES = {"solid": "", "dash": "6 3", "dashdot": "7 3 2 3", "dot": "2 3", "longdash": "11 4"}
 # Marks of curves and of rays' ends, as closed shapes (filled) and strokes, about (0, 0) in a box of 8.
@@ -71,6 +74,11 @@ def embedded(document: Any, **attributes: str) -> str:
     """A document as a script of data, in which no text can end the script."""
     marks = "".join(f' {name.replace("_", "-")}="{html.escape(value)}"' for name, value in attributes.items())
     return f'<script type="application/json"{marks}>{script_safe(json.dumps(document, allow_nan=False))}</script>'
+
+
+def encoded(values: np.ndarray, kind: str) -> str:
+    """An array as base64 of its little-endian bytes, row by row."""
+    return base64.b64encode(np.ascontiguousarray(values, dtype=kind).tobytes()).decode("ascii")
 
 
 def script_safe(text: str) -> str:

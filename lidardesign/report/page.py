@@ -19,11 +19,20 @@ from lidardesign.constraints.slack import ConstraintSlack
 from lidardesign.estimates import figure_and_interval
 from lidardesign.report.choice import choice_section
 from lidardesign.report.density_views import DensityView, density_view
-from lidardesign.report.figures import FONT, MOST_DESIGNS, curve_figure, far_baselines, marginal_figure, plane_figure
+from lidardesign.report.figures import (
+    DASHES,
+    FONT,
+    MOST_DESIGNS,
+    Series,
+    curve_figure,
+    far_baselines,
+    marginal_figure,
+    plane_figure,
+    series,
+)
 from lidardesign.report.markup import embedded, figure, folded, page, paragraphs, section, swatch, switch
 from lidardesign.report.pareto import PANEL_PX, accuracy_tables, pareto_figures
 from lidardesign.report.scene_figure import SceneFigure, constraint_slack_of, evaluated_scene
-from lidardesign.report.series import DASHES, Series, series
 from lidardesign.report.tables import (
     CommandTimes,
     Reproduction,

@@ -10,7 +10,6 @@ from typing import Any
 
 from lidardesign.constraints.slack import ConstraintSlack
 from lidardesign.report.markup import definitions, folded
-from lidardesign.report.series import VERDICT_WORDS
 from lidardesign.run.clock import INSIDE, OTHER
 from lidardesign.scoring.evaluation.entries import MILLIMETRES, EffectSummary
 from lidardesign.scoring.evaluation.results import (
@@ -24,6 +23,8 @@ from lidardesign.scoring.evaluation.results import (
 )
 from lidardesign.sensors.design import DesignSpec
 
+# The words of the report.
+VERDICT_WORDS = {"better": "better", "worse": "worse", "open": "no significant difference"}
 MOST_SENSORS = 60  # listed in a table
 TINY = 1e-4  # from here on the limit is shown
 # Phases of a smaller share of their command, or deeper, are left out; `other` has what they took.

@@ -8,7 +8,6 @@ are switched on.
 
 from __future__ import annotations
 
-import base64
 import html
 import json
 import math
@@ -18,7 +17,8 @@ from typing import Any
 import numpy as np
 
 from lidardesign.numerics import EPSILON_FLOAT32
-from lidardesign.report.markup import embedded, swatch, switch
+from lidardesign.report.figures import OUTCOME_WORDS, Series
+from lidardesign.report.markup import embedded, encoded, swatch, switch
 from lidardesign.report.scene_figure import (
     MOST_FACES,
     PATTERN,
@@ -32,7 +32,6 @@ from lidardesign.report.scene_figure import (
     round_steps,
     scene_bounds,
 )
-from lidardesign.report.series import OUTCOME_WORDS, Series
 from lidardesign.scenes.rays import Outcome
 from lidardesign.scenes.scene import Body, Scene
 from lidardesign.sensors.pattern import field_on_sphere
@@ -85,11 +84,6 @@ def view_document(shown: SceneFigure, looks: Sequence[Series], density_m: np.nda
         "many": MANY_RAYS,
         "faint": FAINT,
     }
-
-
-def encoded(values: np.ndarray, kind: str) -> str:
-    """An array as base64 of its little-endian bytes, row by row."""
-    return base64.b64encode(np.ascontiguousarray(values, dtype=kind).tobytes()).decode("ascii")
 
 
 def drawn_bodies(shown: SceneFigure) -> list[Body]:

@@ -42,7 +42,8 @@ from lidardesign_tasks.surroundings import any_direction
 from lidardesign_tasks.units import doubtful_meshes, doubtful_motion
 from lidardesign_tasks.view import space_around, space_around_box
 
-Axis = Literal["x", "y", "z"]
+Axis = Literal["format", "x", "y", "z"]
+Y_UP = (".glb", ".gltf")  # by their format
 # the file's axes that become the world's x, y, z: a rotation of the up axis to z
 WORLD_AXES = {"x": [1, 2, 0], "y": [2, 0, 1], "z": [0, 1, 2]}
 RELATIVE_JITTER = 0.02  # of the largest extent, where no shift is given
@@ -65,7 +66,7 @@ class MeshesConfig(FolderConfig, Importance):
     folder: Path | None = Field(None, description="folder of mesh files (glb, gltf, obj, off, ply, stl)")
     scale: float = Field(1.0, gt=0, le=FARTHEST_M, description="factor from the files' unit to metres (0.001 for mm)")
     sign: Sign = Field("auto", description="inside rule: auto, solid, winding or unsigned")
-    up: Axis = Field("z", description="the axis of the files that points up")
+    up: Axis = Field("format", description="the axis of the files that points up; format: y in glb and gltf, else z")
     centre: bool = Field(True, description="move the centre of each mesh's bounds to the origin")
     test_share: float = Field(0.5, gt=0, lt=1, description="share of the files that is held out")
     poses: int = Field(4, ge=1, le=1000, description="scenes per mesh")
@@ -343,6 +344,8 @@ def _load_file(
 ) -> Mesh:
     """Read a file, once per process while it is unchanged, as space and both splits need it."""
     mesh = load_mesh(path, sign=sign, scale=scale, painted=painted)
+    if up == "format":
+        up = "y" if path.suffix.lower() in Y_UP else "z"
     vertices = mesh.vertices[:, WORLD_AXES[up]]
     if centre:
         vertices = vertices - (vertices.min(axis=0) + vertices.max(axis=0)) / 2

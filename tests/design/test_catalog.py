@@ -36,7 +36,7 @@ from lidardesign.run.yaml import parse_yaml
 from lidardesign.sensors.design_file import design_document, design_from_document, save_design
 from lidardesign.sensors.pattern import even_subset, grid_rows
 from lidardesign.sensors.sensor import boresight_frame, boresight_of
-from lidardesign.space import DesignSpace, direction
+from lidardesign.space import FARTHEST_M, DesignSpace, direction
 
 LIBRARY = load_library()
 PARTS = {part.name: part for part in LIBRARY.every_mode()}
@@ -126,6 +126,29 @@ def test_a_part_fills_its_field_up_to_one_cell(name):
         # rosettes and pixels are not even: their outermost cells are wider or reached only now and then
         assert found <= width + 1e-9
         assert found >= width * (1 - 2.5 / max(cells, 2.6)) - 1e-9
+
+
+@given(st.floats(1, 120), st.floats(1, 120), st.integers(1, 9), st.integers(1, 9))
+def test_a_module_is_even_zones_of_its_field_and_measures_at_any_range(across, up, columns, rows):
+    name = f"module-{across:.3f}x{up:.3f}-{columns}x{rows}"
+    part = find_part(name)
+    assert (part.name, part.grid, part.rays) == (name, (columns, rows), columns * rows)
+    half = np.radians([float(f"{across:.3f}"), float(f"{up:.3f}")]) / 2
+    angles = to_angles("tangent", part.directions)
+    steps = [2 * half[0] / columns, 2 * half[1] / rows]
+    np.testing.assert_allclose(np.unique(np.round((angles + half) / steps - 0.5, 6), axis=0)[:, 0].max(), columns - 1)
+    np.testing.assert_allclose(np.abs(angles).max(axis=0), half * (1 - 1 / np.array([columns, rows])), atol=1e-9)
+    assert part.range_m[0] == 0.0
+    assert part.range_m[1] == FARTHEST_M
+
+
+@pytest.mark.parametrize(
+    "name", ["module-45-8x8", "module-45x45", "module-x-8x8", "module-45x45-0x8", "module-45x200-8x8"]
+)
+def test_a_module_without_a_possible_field_or_zones_is_refused(name):
+    with pytest.raises(ConfigError) as refused:
+        find_part(name)
+    assert refused.value.allowed
 
 
 def test_zones_stand_at_the_centres_of_their_cells_never_on_the_edge():

@@ -137,7 +137,7 @@ def baseline_document(difference=-0.5, low=-0.9, high=-0.1):
 
 def test_a_baseline_is_beaten_where_the_interval_says_so(script):
     baselines = script("baselines")
-    cases = {"better": (-0.5, -0.9, -0.1), "worse": (0.5, 0.1, 0.9), "no difference": (-0.1, -0.5, 0.4)}
+    cases = {"better": (-0.5, -0.9, -0.1), "worse": (0.5, 0.1, 0.9), "no significant difference": (-0.1, -0.5, 0.4)}
     for word, numbers in cases.items():
         found = baseline_document(*numbers)
         (row,) = [row for row in baselines.equal_rays(found) if row[1] == "bounding"]

@@ -22,7 +22,7 @@ from support.report_pages import (
     ray_segments,
 )
 
-from lidardesign.report.figures import curve_figure, far_baselines, marginal_figure, plane_figure
+from lidardesign.report.figures import curve_figure, far_baselines, marginal_figure, plane_figure, series
 from lidardesign.report.markup import asset
 from lidardesign.report.page import report_html
 from lidardesign.report.scene_figure import (
@@ -40,7 +40,6 @@ from lidardesign.report.scene_figure import (
     round_steps,
     thinned,
 )
-from lidardesign.report.series import series
 from lidardesign.report.tables import (
     CommandTimes,
     constraints_table,

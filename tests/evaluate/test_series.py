@@ -7,8 +7,8 @@ import pytest
 from support.evaluations import make_evaluation
 from support.sensors import normal_sensor
 
+from lidardesign.report.figures import COLOURS, axis_titles, log_ticks, logarithmic, series
 from lidardesign.report.scene_figure import constraint_slack_of
-from lidardesign.report.series import COLOURS, axis_titles, log_ticks, logarithmic, series
 from lidardesign.scoring.evaluation.results import csv_text, write_csv
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.space import DesignSpace

@@ -157,8 +157,11 @@ def _named(pieces: Sequence[ModelGeom], patterns: Names, key: str) -> np.ndarray
         fits = np.array([fnmatchcase(body, pattern) or fnmatchcase(geom, pattern) for body, geom in names], dtype=bool)
         if not fits.any():
             every = list(dict.fromkeys(name for pair in names for name in pair if name))
+            # what someone calls a hand or a gripper is often the last body of a chain
+            last = next((body for body, _ in names[::-1] if body), every[-1])
+            hint = suggest(pattern.strip("*"), every) or f"the last body is {last!r}"
             raise ConfigError(f"no visible body or geom is called {pattern!r}", where=f"task.{key}",
-                              allowed=listed(every), hint=suggest(pattern.strip("*"), every))  # fmt: skip
+                              allowed=listed(every), hint=hint)  # fmt: skip
         found |= fits
     return found
 
