@@ -1,8 +1,8 @@
 """The rangefinders of a MuJoCo model (MJCF): each is one ray along the +z axis of its site.
 
-Rangefinders of one body with the same origin are one sensor, and so are those of a body that has the sensor's name and
-sites NAME_r0, NAME_r1, ... for its rays, as `export --format mjcf` writes them; these keep the starts of their gates in
-the rangefinders' user data. Rays are at the initial poses of the model's bodies.
+Rangefinders of one body with the same origin are one sensor, and so are those on sites NAME_r0, NAME_r1, ... with the
+user data of rays, as `export --format mjcf` writes them with the starts of gates. Rays are at the initial poses of the
+model's bodies.
 
 MuJoCo compiles only the elements that define poses of rangefinders, as a model of its own that reads nothing from disk
 and runs nothing: bodies, frames, sites and their defaults are kept; shapes, joints, meshes, actuators and plugins are
@@ -129,7 +129,8 @@ class _Copier:
 # Largest distance between origins of one sensor's rays in files of few digits [m].
 SAME_PLACE_M = 1e-4
 # Suffixes of the names of a sensor's rays: `front_r12` and `front_r13` are of `front`.
-EXPORTED = re.compile(r"_r\d+")
+EXPORTED = re.compile(r"(.+)_r\d+")
+USER_VALUES = 4  # of an exported rangefinder: gate start and end, sensor, time
 COUNTED = re.compile(r"[\s_.-]+(r|ray)?[\s_.-]*\d*$|\d+$")
 
 
@@ -157,16 +158,16 @@ class _Ray:
     user: tuple[float, ...]
 
     @property
-    def is_exported(self) -> bool:
-        """True if its site is named as a ray that `export` wrote for the sensor of its body."""
-        named = self.body > 0 and self.body_name and self.site_name.startswith(self.body_name)
-        return bool(named) and EXPORTED.fullmatch(self.site_name, len(self.body_name)) is not None
+    def exported(self) -> str | None:
+        """The name of its sensor where its site and user data are those of a ray that `export` wrote."""
+        found = EXPORTED.fullmatch(self.site_name)
+        return found.group(1) if found and self.body > 0 and self.start_m is not None else None
 
     @property
     def start_m(self) -> float | None:
         """Start of its gate in an export's user data [m], or None."""
         start, end = (*self.user, 0.0, 0.0)[:2]
-        return start if self.is_exported and 0 <= start <= end == self.cutoff_m else None
+        return start if len(self.user) >= USER_VALUES and 0 <= start <= end == self.cutoff_m else None
 
 
 def read_mjcf(path: Path) -> Rig:
@@ -239,10 +240,12 @@ def _groups(rays: Sequence[_Ray]) -> list[list[int]]:
     groups: list[list[int]] = []
     # groups by body and cell of their first ray
     near: dict[tuple[int, ...], list[list[int]]] = {}
-    exported: dict[int, list[int]] = {}
+    exported: dict[tuple[int, str], list[int]] = {}
     for index, ray in enumerate(rays):
-        if ray.is_exported and ray.body in exported:
-            exported[ray.body].append(index)
+        if ray.exported is not None:
+            exported.setdefault((ray.body, ray.exported), []).append(index)
+            if exported[ray.body, ray.exported] == [index]:
+                groups.append(exported[ray.body, ray.exported])
             continue
         cell = np.floor(ray.origin_m / SAME_PLACE_M).astype(np.int64)
         around = [(ray.body, *(cell + np.array(step) - 1).tolist()) for step in np.ndindex(3, 3, 3)]
@@ -253,16 +256,14 @@ def _groups(rays: Sequence[_Ray]) -> list[list[int]]:
             group.append(index)
             continue
         groups.append([index])
-        if ray.is_exported:
-            exported[ray.body] = groups[-1]
         near.setdefault((ray.body, *cell.tolist()), []).append(groups[-1])
     return groups
 
 
 def _name(own: Sequence[_Ray], *, alone: bool) -> str:
     """Common prefix of the names of a sensor's rays, or the name of its body if it has no other sensor."""
-    if own[0].is_exported:
-        return own[0].body_name
+    if own[0].exported is not None:
+        return own[0].exported
     if len(own) == 1 and own[0].name:
         return own[0].name
     names = [ray.name for ray in own]

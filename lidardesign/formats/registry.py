@@ -33,6 +33,7 @@ class Exporter:
         rated: Whether it holds the frame rate, so that `write` takes `rate_hz` too.
         following: Whether it holds patterns that follow what they see.
         robotic: Whether it can hold a robot's model with the sensors in it, so that `write` takes `robot` too.
+        steppable: Whether a frame rate of 0 means every step of a simulation.
     """
 
     name: str
@@ -46,6 +47,7 @@ class Exporter:
     rated: bool = False
     robotic: bool = False
     following: bool = False
+    steppable: bool = False
 
     def write(
         self,
@@ -96,8 +98,9 @@ class Exporter:
         Raises:
             ConfigError: Such a rate.
         """
-        if rate_hz is not None and not SLOWEST_HZ <= rate_hz <= FASTEST_HZ:
-            raise ConfigError(f"{rate_hz}", where="--rate-hz", allowed=f"{SLOWEST_HZ:g} to {FASTEST_HZ:g} Hz")
+        if rate_hz is not None and not SLOWEST_HZ <= rate_hz <= FASTEST_HZ and not (self.steppable and rate_hz == 0):
+            every = ", or 0: at every step" if self.steppable else ""
+            raise ConfigError(f"{rate_hz}", where="--rate-hz", allowed=f"{SLOWEST_HZ:g} to {FASTEST_HZ:g} Hz{every}")
         if rate_hz is not None and not self.rated:
             rated = ", ".join(name for name, exporter in EXPORTERS.items() if exporter.rated)
             raise ConfigError(
@@ -153,6 +156,8 @@ EXPORTERS: dict[str, Exporter] = {
             "lidardesign.formats.robots",
             "write_mjcf",
             robotic=True,
+            rated=True,
+            steppable=True,
             reader="MuJoCo",
             checked="loaded and run in MuJoCo: its distances agree with ours",
         ),

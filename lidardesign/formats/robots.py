@@ -1,12 +1,12 @@
 """Robots and their simulators as XML: MuJoCo, Gazebo and ROS.
 
-MuJoCo: a body per sensor, a site per ray whose +z looks along it, and a rangefinder on each.
+MuJoCo: a site per ray whose +z looks along it, and a rangefinder on each that fires at the frame rate. Sites are on the
+body that carries the sensors, which rangefinders then do not see, or in the world on a body per sensor.
 
 `sensordata` has the rays in their own order: the distance [m], negative without a hit, the gate's end for hits beyond
 it (`cutoff`). The start of the gate, the sensor's number and the firing time are in the rangefinder's user data, which
 MuJoCo keeps (`model.sensor_user`) and does not use. The file is a model of its own and may be included in another one,
-or a copy of a robot's with the sensors on one of its bodies. Rangefinders ignore geoms of their own body, of which
-those of sensors have none, and fully transparent ones.
+or a copy of a robot's with the sensors in it. Rangefinders ignore fully transparent geoms.
 
 Gazebo and ROS: a gpu_lidar per sensor, in SDF 1.9, in a URDF, or in a xacro macro.
 
@@ -34,6 +34,7 @@ from xml.etree.ElementTree import Element, fromstring
 import numpy as np
 
 from lidardesign.errors import DataError
+from lidardesign.formats.mjcf import EXPORTED, USER_VALUES
 from lidardesign.formats.mounts import (
     Mount,
     channel_mounts,
@@ -63,16 +64,22 @@ WORLD = "world"
 # Drawn radius of a ray's site [m].
 SITE_SIZE_M = 0.002
 UNSEEN = "lidardesign_unseen"
-USER_VALUES = 4  # of a rangefinder: gate start and end, sensor, time
 
 
-def write_mjcf(design: DesignSpec, rays: Rays, path: Path, robot: RobotFile | None = None) -> list[str]:
+def write_mjcf(
+    design: DesignSpec,
+    rays: Rays,
+    path: Path,
+    rate_hz: float = Bandwidth().rate_hz,
+    robot: RobotFile | None = None,
+) -> list[str]:
     """Write the model, atomically; returns notes of what the format cannot hold.
 
     Arguments:
         design: The design; with a robot its sensors are on the body that it is mounted on, else in the world.
         rays: Its rays.
         path: The file.
+        rate_hz: How often rangefinders fire [Hz]; 0: at every step.
         robot: A MuJoCo model, MJCF or URDF; the file is a copy of it with the sensors added.
 
     Raises:
@@ -83,16 +90,20 @@ def write_mjcf(design: DesignSpec, rays: Rays, path: Path, robot: RobotFile | No
     model, taken = element("mujoco", {"model": design.name}, [place, sensors]), [WORLD]
     if robot is not None:
         model, place, sensors = _robot_with(design.mount, robot, path)
-        taken += [body.get("name", "") for body in model.iter("body")]
+        sites = [EXPORTED.fullmatch(one.get("name", "")) for one in model.iter("site")]
+        taken += [one.get("name", "") for one in model.iter("body")] + [one.group(1) for one in sites if one]
         notes.append(
             "geoms of the robot that are not shown are transparent, since MuJoCo's rays pass through no others"
         )
-    bodies = distinct([xml_text(one.sensor.name) for one in mounted], " ", taken=taken)
+    names = distinct([xml_text(one.sensor.name) for one in mounted], " ", taken=taken)
     site = np.empty(len(rays), dtype=object)
-    for mount, name in zip(mounted, bodies, strict=True):
+    for mount, name in zip(mounted, names, strict=True):
         site[mount.ray] = [f"{name}_r{number}" for number in range(len(mount.ray))]
-        place.append(_body(mount, name, rays, site[mount.ray]))
-    sensors.extend(_rangefinder(str(site[ray]), rays, ray) for ray in range(len(rays)))
+        if place.tag == "body":
+            place.extend(_sites(rays.origin_m[mount.ray], rays.direction[mount.ray], site[mount.ray]))
+        else:
+            place.append(_body(mount, name, rays, site[mount.ray]))
+    sensors.extend(_rangefinder(str(site[ray]), rays, ray, rate_hz) for ray in range(len(rays)))
     write_atomic(path, document(model))
     late = rays.gate_m[rays.gate_m[:, 0] > 0, 0]
     if len(late):
@@ -100,7 +111,14 @@ def write_mjcf(design: DesignSpec, rays: Rays, path: Path, robot: RobotFile | No
             f"MuJoCo has no gate start: {len(late)} of {len(rays)} rays also see what is nearer than theirs, of "
             f"{late.min():.3g} to {late.max():.3g} m; it stands in the rangefinders' user data"
         )
-    return [*notes, "a reading equal to the cutoff is a hit at or beyond the end of the gate; a negative one is no hit"]
+    if place.tag == "body":
+        notes.append(f"rays pass through the geoms of {design.mount!r}, which the sensors are on")
+    when = f"at {rate_hz:g} Hz; in between they keep what they read" if rate_hz else "at every step"
+    return [
+        *notes,
+        f"rangefinders fire {when}",
+        "a reading equal to the cutoff is a hit at or beyond the end of the gate; a negative one is no hit",
+    ]
 
 
 def _robot_with(mount: str | None, robot: RobotFile, path: Path) -> tuple[Element, Element, Element]:
@@ -134,31 +152,38 @@ def _robot_with(mount: str | None, robot: RobotFile, path: Path) -> tuple[Elemen
 
 
 def _body(mount: Mount, name: str, rays: Rays, sites: np.ndarray) -> Element:
+    """The body of a sensor in the world, with a site per ray in the sensor's frame."""
     frame = mount.sensor.frame
     places = (rays.origin_m[mount.ray] - mount.origin_m) @ frame.T
-    # The shortest rotations of +z to unit vectors (N, 3), as quaternions (w, x, y, z), shape (N, 4)
-    x, y, z = (rays.direction[mount.ray] @ frame.T).T
+    pose = {"pos": numbers(mount.origin_m), "quat": numbers(mount.quaternion)}
+    return element("body", {"name": name, **pose}, _sites(places, rays.direction[mount.ray] @ frame.T, sites))
+
+
+def _sites(places_m: np.ndarray, directions: np.ndarray, names: np.ndarray) -> list[Element]:
+    """Sites whose +z looks along directions (N, 3)."""
+    # the shortest rotations of +z to unit vectors, as quaternions (w, x, y, z), shape (N, 4)
+    x, y, z = directions.T
     across = np.hypot(x, y)
     half = np.arctan2(across, z) / 2
     # straight down any horizontal axis is right
     along = np.where(across > 0, across, 1.0)
     axis_x, axis_y = np.where(across > 0, -y / along, 1.0), x / along
     turns = np.stack([np.cos(half), np.sin(half) * axis_x, np.sin(half) * axis_y, np.zeros(len(x))], axis=1)
-    made = [
+    return [
         element(
             "site",
-            {"name": str(site), "pos": numbers(place), "quat": numbers(turn), "size": number(SITE_SIZE_M)},
+            {"name": str(name), "pos": numbers(place), "quat": numbers(turn), "size": number(SITE_SIZE_M)},
         )
-        for site, place, turn in zip(sites, places, turns, strict=True)
+        for name, place, turn in zip(names, places_m, turns, strict=True)
     ]
-    return element("body", {"name": name, "pos": numbers(mount.origin_m), "quat": numbers(mount.quaternion)}, made)
 
 
-def _rangefinder(site: str, rays: Rays, ray: int) -> Element:
+def _rangefinder(site: str, rays: Rays, ray: int, rate_hz: float) -> Element:
     start, end = rays.gate_m[ray]
     user = numbers([start, end, rays.sensor[ray], rays.time_s[ray]])
-    # a cutoff of 0 means none
-    return element("rangefinder", {"name": site, "site": site, "cutoff": number(max(end, SLACK)), "user": user})
+    # a cutoff of 0 means none; without a number of samples MuJoCo ignores the interval
+    rate = {"nsample": "1", "interval": number(1 / rate_hz)} if rate_hz else {}
+    return element("rangefinder", {"name": site, "site": site, "cutoff": number(max(end, SLACK)), "user": user, **rate})
 
 
 LINK = "lidar"

@@ -164,7 +164,9 @@ def test_sensors_on_a_robot_measure_our_distances_wherever_it_is(tmp_path, robot
     data.qpos[:] = alone.qpos0 + generator.normal(0, 0.3, model.nq)
     mujoco.mj_normalizeQuat(model, data.qpos)
     mujoco.mj_forward(model, data)
-    scene = Scene(tuple(part.body for part in bodies_from_mujoco(alone, data.qpos)))
+    # what a sensor is on is not in its way
+    parts = bodies_from_mujoco(alone, data.qpos)
+    scene = Scene(tuple(part.body for part in parts if mount is None or part.body_name != mount))
     torso = rigid(data.body("torso").xmat.reshape(3, 3), data.body("torso").xpos)
     pose = np.eye(4) if mount is None else torso
     ours = SceneCaster(scene).first_hit(RAYS.origin_m @ pose[:3, :3].T + pose[:3, 3], RAYS.direction @ pose[:3, :3].T)
@@ -177,6 +179,48 @@ def test_sensors_on_a_robot_measure_our_distances_wherever_it_is(tmp_path, robot
     np.testing.assert_array_equal(model.sensor_user[-len(RAYS) :, 2], RAYS.sensor)
 
 
+@pytest.mark.parametrize("rate_hz", [0, 10, 20, 33])
+def test_rangefinders_fire_at_the_frame_rate_and_keep_what_they_read(tmp_path, rate_hz):
+    import mujoco
+
+    path = tmp_path / "with.xml"
+    EXPORTERS["mjcf"].write(replace(DESIGN, mount="torso"), RAYS, path, rate_hz, RobotFile(own_robot(tmp_path)))
+    model = mujoco.MjModel.from_xml_path(str(path))
+    every = mujoco.MjModel.from_xml_path(str(path))
+    every.sensor_interval[:] = 0
+    read = []
+    for one in (model, every):
+        data, steps = mujoco.MjData(one), []
+        for _ in range(200):
+            mujoco.mj_step(one, data)
+            steps.append(data.sensordata[-len(RAYS) :].copy())
+        read.append(np.array(steps))
+    held, always = read
+    fires = np.flatnonzero(np.abs(np.diff(held, axis=0)).max(axis=1) > 0) + 1
+    if rate_hz == 0:
+        np.testing.assert_array_equal(held, always)
+        return
+    period = 1 / rate_hz / model.opt.timestep
+    assert len(fires) >= 0.6 * 200 / period  # what it reads may be the same again
+    assert all(min(step % period, period - step % period) <= 1 + 1e-6 for step in fires)
+    np.testing.assert_array_equal(held[fires], always[fires])
+
+
+def test_sensors_on_a_robot_are_read_back(tmp_path):
+    path = tmp_path / "with.xml"
+    still = ROBOT.replace('name="torso" pos="0 0 1"', 'name="torso"')
+    robot = own_robot(tmp_path)
+    robot.write_text(still)
+    EXPORTERS["mjcf"].write(replace(DESIGN, mount="torso"), RAYS, path, robot=RobotFile(robot))
+    again = load_design(path, reach_m=9.0)
+    own = [sensor for sensor in again.sensors if sensor.name in NAMES or sensor.name.startswith("front left")]
+    assert len(again.sensors) == len(DESIGN.sensors) + 1  # and the robot's own rangefinder
+    rays = again.rays(len(RAYS) + 1)
+    assert own
+    np.testing.assert_allclose(rays.direction[-len(RAYS) :], RAYS.direction, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(rays.gate_m[-len(RAYS) :, 0], RAYS.gate_m[:, 0], rtol=0, atol=1e-5)
+
+
 def test_a_mounted_design_goes_into_the_model_of_its_run(tmp_path):
     config = SimpleNamespace(task=SimpleNamespace(model=own_robot(tmp_path), folder=tmp_path))
     fixed = replace(DESIGN, mount="torso")
@@ -184,7 +228,7 @@ def test_a_mounted_design_goes_into_the_model_of_its_run(tmp_path):
     exported = ExportRequest(source, EXPORTERS["mjcf"], tmp_path / "with.xml").write()
     assert exported.rays == len(RAYS)
     model, data = simulated(exported.path)
-    assert model.body(model.body("front_left").parentid[0]).name == "torso"
+    assert {model.body(int(body)).name for body in model.site_bodyid} == {"torso"}
     assert len(data.sensordata) == len(RAYS) + 1
     again = ExportRequest(source, EXPORTERS["mjcf"], tmp_path / "both.xml", robot=exported.path).write()
     model, data = simulated(again.path)
