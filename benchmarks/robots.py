@@ -137,7 +137,9 @@ def misread_m(run: Path, model_file: Path, exported: Path, case: Case, options: 
         data.qpos[:] = with_sensors.qpos0
         mujoco.mj_integratePos(with_sensors, data.qpos, generator.normal(0.0, 0.2, with_sensors.nv), 1.0)
         mujoco.mj_forward(with_sensors, data)
-        scene = Scene(tuple(piece.body for piece in bodies_from_mujoco(alone, data.qpos)))
+        pieces = bodies_from_mujoco(alone, data.qpos)
+        # rays pass through what carries the sensors
+        scene = Scene(tuple(piece.body for piece in pieces if mount is None or piece.body_name != mount))
         pose = np.eye(4)
         if mount is not None:
             pose = rigid(data.body(mount).xmat.reshape(3, 3), data.body(mount).xpos)
