@@ -15,7 +15,7 @@ TASKS = ROOT / "tasks" / "lidardesign_tasks"
 MOST_MODULES = 14
 MOST_PARAMETERS = 12
 # Of the whole program: one person owns it.
-MOST_STATEMENTS, MOST_MODULES_IN_ALL, MOST_COMMAND_PARAMETERS, MOST_CLI_LINES = 29_200, 229, 164, 3_636
+MOST_STATEMENTS, MOST_MODULES_IN_ALL, MOST_COMMAND_PARAMETERS, MOST_CLI_LINES = 29_500, 234, 171, 3_800
 # Functions that take what commands take, each choice by its name.
 API = {"constrain", "evaluate", "evaluate_seeds", "fit", "learn"}
 
@@ -23,7 +23,7 @@ API = {"constrain", "evaluate", "evaluate_seeds", "fit", "learn"}
 ROOMS = (
     "errors", "numerics", "estimates", "run", "space", "scenes", "samples", "task", "registry", "config", "run_folder",
     "workers", "density", "sensors", "parts", "constraints", "mixture", "simulate", "rays", "formats", "scoring",
-    "fitting", "report", "contract", "api", "cli", "__main__",
+    "fitting", "report", "clouds", "contract", "api", "cli", "__main__",
 )  # fmt: skip
 
 # Where a library may be imported, by the beginnings of module names; nowhere else.

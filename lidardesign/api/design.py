@@ -20,7 +20,7 @@ from lidardesign.api.export import (
     exporter_of,
 )
 from lidardesign.constraints.document import Constraints
-from lidardesign.errors import ConfigError, DataError, names_arguments
+from lidardesign.errors import ConfigError, DataError, check_number, names_arguments
 from lidardesign.fitting.options import FitOptions
 from lidardesign.fitting.request import FitRequest, FitResult
 from lidardesign.formats.designs import need_run, reach_beside, read_design, relative_folder, run_of
@@ -28,7 +28,7 @@ from lidardesign.rays.information import FEW_SCENES
 from lidardesign.run.clock import WAIT_S, Progress, phase
 from lidardesign.run.files import run_lock
 from lidardesign.run.manifest import write_recorded
-from lidardesign.run_folder import Notes, RunFolder, ignore, log_note
+from lidardesign.run_folder import Notes, RunFolder, ignore, log_note, settings_texts
 from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.compare import outside_space
 from lidardesign.sensors.design import DesignSpec, certificates_of
@@ -37,7 +37,10 @@ from lidardesign.task import scoring_settings
 from lidardesign.workers import check_workers, opened_workers
 
 if TYPE_CHECKING:
+    from lidardesign.clouds.seen import SeenScene
     from lidardesign.report.figures import Figure
+
+MOST_SCENES = 10_000
 
 
 class Design(DesignSource):
@@ -243,6 +246,51 @@ class Design(DesignSource):
         exporter = exporter_of(format, out)
         target = export_target(self.path, out, exporter)
         return ExportRequest(self, exporter, target, rays, at or {}, rate_hz, robot).write(notes=notes)
+
+    @names_arguments
+    def simulate(
+        self,
+        scene: Path | str | None = None,
+        *,
+        scenes: int = 1,
+        rays: int | None = None,
+        detector: str = "ideal",
+        effects: str = "auto",
+        settings: Sequence[str] | Mapping[str, Any] = (),
+        seed: int | None = None,
+        scale: float = 1.0,
+        notes: Notes = log_note,
+    ) -> list[SeenScene]:
+        """What it sees in held-out scenes, with the effects that they call for, or in a mesh or robot of your own.
+
+        Arguments:
+            scene: A mesh file, or a MuJoCo model in its initial configuration; None: held-out scenes of its run.
+            scenes: How many held-out scenes.
+            rays: Rays per frame; its own by default, or the largest number of its task.
+            detector: The name of a detector, or its file.
+            effects: auto, all, none, or names of effects between commas.
+            settings: Settings of the task, for scenes other than the learned ones.
+            seed: Seed of all random numbers; the run's by default.
+            scale: Factor from the unit of a mesh to metres (0.001 for mm).
+            notes: Called with every note.
+
+        Raises:
+            ConfigError: An unknown choice, or no run to take scenes from.
+            DataError: The file of the scene cannot be read.
+        """
+        from lidardesign.clouds.seen import Measuring, scene_of_file, seen_in_file, seen_scenes
+
+        check_number(scenes, "--scenes", 1, MOST_SCENES, whole=True)
+        count = self.usual_count(notes) if rays is None else rays
+        measuring = Measuring(detector, effects, seed)
+        if scene is None:
+            run = need_run(self.run, self.name)
+            return seen_scenes(run, self.specification, count, scenes, measuring, settings_texts(settings))
+        return [
+            seen_in_file(
+                scene_of_file(Path(scene), self.specification.mount, scale), self.specification, count, measuring
+            )
+        ]
 
     def figure(self, count: int | None = None) -> Figure:
         """Its sensors in space, with fields of view and gates, and its rays where their number is given (plotly)."""

@@ -18,6 +18,7 @@ from lidardesign.cli.commands.export import export
 from lidardesign.cli.commands.fit import constrain, fit
 from lidardesign.cli.commands.learn import learn
 from lidardesign.cli.commands.show import show
+from lidardesign.cli.commands.simulate import simulate
 from lidardesign.cli.commands.tasks import tasks_app
 from lidardesign.cli.terminal.options import StrictCommand
 from lidardesign.cli.terminal.output import (
@@ -69,6 +70,10 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "lidardesign evaluate rig.csv other.csv --in runs/face --baseline none",
         "lidardesign evaluate runs/arm --baseline occupancy --workers 8",
     ),
+    "simulate": (
+        "lidardesign simulate runs/face/designs/free.yaml --format mcap --out faces.mcap --scenes 20",
+        "lidardesign simulate runs/face/designs/free.yaml --scene cup.stl --scale 0.001 --out cup",
+    ),
     "export": (
         "lidardesign export --list",
         "lidardesign export runs/face/designs/free.yaml --format csv --rays 576",
@@ -96,6 +101,7 @@ PAGES = {
     "fit": "design-file.md, selection.md, parts.md, importance.md",
     "constrain": "constraints.md, catalog.md",
     "evaluate": "evaluate.md, baselines.md, detectors.md, shell.md",
+    "simulate": "formats.md, detectors.md",
     "export": "formats.md, design-file.md",
     "capture": "captures.md",
     "show": "design-file.md, rigs.md, formats.md",
@@ -127,7 +133,7 @@ app = typer.Typer(
 app.add_typer(tasks_app, name="tasks", context_settings=SETTINGS)
 app.add_typer(catalog_app, name="catalog", context_settings=SETTINGS)
 app.add_typer(config_app, name="config", context_settings=SETTINGS)
-for subcommand in (learn, fit, constrain, evaluate, export, capture, show):
+for subcommand in (learn, fit, constrain, evaluate, simulate, export, capture, show):
     app.command()(subcommand)
 for prefix, group in (("", app), ("tasks ", tasks_app), ("catalog ", catalog_app), ("config ", config_app)):
     for registered in group.registered_commands:

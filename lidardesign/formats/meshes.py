@@ -35,8 +35,9 @@ RAY = [
     for name, kind in (("gate_start", "<f8"), ("gate_end", "<f8"), ("time", "<f8"), ("sensor", "<i4"))
 ]
 FACE = [("corners", "u1"), ("vertex_indices", "<i4", (4,))]
+FACES = [("corners", "u1"), ("vertex_indices", "<i4", (3,))]  # triangles
 EDGE = [("vertex1", "<i4"), ("vertex2", "<i4")]
-TYPES = {"f8": "double", "u1": "uchar", "i4": "int"}
+TYPES = {"f8": "double", "f4": "float", "u1": "uchar", "u2": "ushort", "i4": "int", "u4": "uint"}
 # Distinguishable with every kind of colour vision (Okabe and Ito 2008).
 COLOURS = np.array(
     [(0, 114, 178), (230, 159, 0), (0, 158, 115), (204, 121, 167), (86, 180, 233), (213, 94, 0), (240, 228, 66)]
@@ -53,7 +54,7 @@ def write_ply(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
         f"comment sensor {index} {json.dumps(one.name[:LONGEST_NAME])}" for index, one in enumerate(design.sensors)
     ]
     seen = [(index, one) for index, one in enumerate(design.sensors) if min(one.field_of_view_rad) > 0]
-    files = {RAYS: _file(comments, vertex=_ray_points(rays)), BEAMS: _beams(rays, comments)}
+    files = {RAYS: ply_file(comments, vertex=_ray_points(rays)), BEAMS: _beams(rays, comments)}
     if seen:
         files[FRUSTA] = _frusta(seen, comments)
     notes = [*write_folder(path, files), "weights and origin covariances of the sensors are lost"]
@@ -66,7 +67,8 @@ def write_ply(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     return notes
 
 
-def _file(comments: list[str], **elements: np.ndarray) -> bytes:
+def ply_file(comments: list[str], **elements: np.ndarray) -> bytes:
+    """A PLY file of tables by the names of its elements, with comments."""
     header = ["ply", "format binary_little_endian 1.0", "comment lidardesign, metres, z up", *comments]
     for name, table in elements.items():
         header.append(f"element {name} {len(table)}")
@@ -77,7 +79,7 @@ def _file(comments: list[str], **elements: np.ndarray) -> bytes:
 
 
 def _properties(kinds: np.dtype) -> list[str]:
-    if kinds == np.dtype(FACE):
+    if "vertex_indices" in (kinds.names or ()):
         return ["property list uchar int vertex_indices"]
     return [f"property {TYPES[kinds[name].str[1:]]} {name}" for name in kinds.names or ()]
 
@@ -104,7 +106,9 @@ def _beams(rays: Rays, comments: list[str]) -> bytes:
     places = rays.origin_m[:, None] + rays.gate_m[:, :, None] * rays.direction[:, None]
     edges = np.zeros(len(rays), dtype=EDGE)
     edges["vertex1"], edges["vertex2"] = np.arange(2 * len(rays)).reshape(-1, 2).T
-    return _file(comments, vertex=_points(places.reshape(-1, 3), np.repeat(rays.sensor, 2), PLACE + COLOUR), edge=edges)
+    return ply_file(
+        comments, vertex=_points(places.reshape(-1, 3), np.repeat(rays.sensor, 2), PLACE + COLOUR), edge=edges
+    )
 
 
 def _frusta(sensors: list[tuple[int, Sensor]], comments: list[str]) -> bytes:
@@ -125,7 +129,7 @@ def _frusta(sensors: list[tuple[int, Sensor]], comments: list[str]) -> bytes:
         faces.append(corners + number * len(places))
     table = np.zeros(len(faces) * len(corners), dtype=FACE)
     table["corners"], table["vertex_indices"] = 4, np.concatenate(faces)
-    return _file(comments, vertex=np.concatenate(points), face=table)
+    return ply_file(comments, vertex=np.concatenate(points), face=table)
 
 
 def _frustum(sensor: Sensor) -> np.ndarray:

@@ -109,6 +109,14 @@ def score_lists(
             yield score, time.perf_counter() - started + per_ray * _count(positions)
 
 
+def returns_in_scene(
+    scene: Scene, positions: RaysPerCondition, casters: Sequence[SceneCaster], physics: Physics | None
+) -> list[Returns]:
+    """The returns by which `score_lists` scores one set of rays."""
+    found = simulate_many(scene, positions, casters=casters, physics=physics, repeats=_repeats(positions))
+    return returns_of(positions, scene, found)
+
+
 def _repeats(positions: RaysPerCondition) -> Sequence[int]:
     """The random draw of each list of rays: another at every condition value, the same for patterns of one frame."""
     return [0] * len(positions) if isinstance(positions, AdaptiveRays) else range(len(positions))

@@ -12,7 +12,7 @@ import typer
 
 from lidardesign.cli.terminal import options
 from lidardesign.cli.terminal.grids import RichConsole
-from lidardesign.cli.terminal.options import detectors, words
+from lidardesign.cli.terminal.options import words
 from lidardesign.cli.terminal.output import Output, claim_outputs, command, keep_times
 from lidardesign.cli.terminal.score_tables import show_accuracy, show_evaluation
 from lidardesign.run.clock import phase
@@ -90,15 +90,7 @@ def evaluate(
             autocompletion=words("auto|all|none|audit"),
         ),
     ] = "auto",
-    detector: Annotated[
-        str,
-        typer.Option(
-            "--detector",
-            metavar="NAME|FILE",
-            help="The detector: ideal, single-photon, consumer-8x8, or a YAML file.",
-            autocompletion=detectors,
-        ),
-    ] = "ideal",
+    detector: options.Detector = "ideal",
     range_tolerance_mm: Annotated[
         float | None,
         typer.Option(

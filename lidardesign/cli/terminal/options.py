@@ -177,6 +177,15 @@ ModuleField = Annotated[
 ModuleZones = Annotated[
     str | None, typer.Option("--zones", metavar="CxR", help="Of modules, as 8x8.", show_default=False)
 ]
+Detector = Annotated[
+    str,
+    typer.Option(
+        "--detector",
+        metavar="NAME|FILE",
+        help="The detector: ideal, single-photon, consumer-8x8, or a YAML file.",
+        autocompletion=detectors,
+    ),
+]
 Judge = Annotated[
     str | None,
     typer.Option(

@@ -1,0 +1,214 @@
+"""What a design sees in a scene: its returns as clouds of points, and the target surface that no sensor sees."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from lidardesign.config import with_task_settings
+from lidardesign.errors import DataError
+from lidardesign.report.scene_figure import own_triangles, scene_bounds
+from lidardesign.run.clock import phase
+from lidardesign.run_folder import RunFolder
+from lidardesign.scenes.casting import SceneCaster
+from lidardesign.scenes.mesh_files import SUFFIXES, load_mesh
+from lidardesign.scenes.rays import Returns
+from lidardesign.scenes.scene import Body, Mesh, Scene, inverse_rigid
+from lidardesign.scoring.evaluation.entries import entries_of
+from lidardesign.scoring.evaluation.request import EvaluationRequest
+from lidardesign.scoring.scene_scores import RaysPerCondition, returns_in_scene
+from lidardesign.sensors.design import DesignSpec
+from lidardesign.sensors.sensor import Sensor
+from lidardesign.simulate.calibration import with_part_light
+from lidardesign.simulate.detector.files import load_detector
+from lidardesign.simulate.plan import Planner, Tolerance, parse_effects
+from lidardesign.simulate.returns import build_casters
+
+# Columns of a cloud with their types in files; points are rounded last.
+COLUMNS = (
+    ("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("t", "<u4"), ("ring", "<u2"), ("outcome", "u1"),
+    ("occluder", "u1"), ("ray", "<u4"),
+)  # fmt: skip
+NANOSECONDS = 1e9
+ROUND_SHARE = 0.02  # of a round body's extent: as far are its triangles from it
+ROUNDING = 1e-6  # of a distance
+
+
+@dataclass(frozen=True, eq=False)
+class SeenScene:
+    """What a design returns in a scene.
+
+    Arguments:
+        design: The design.
+        scene: The scene.
+        returns: One entry per frame; along a condition all frames of every value in turn.
+        effects: Names of the effects that were simulated.
+    """
+
+    design: DesignSpec
+    scene: Scene
+    returns: Sequence[Returns]
+    effects: tuple[str, ...] = ()
+
+    def points_m(self, number: int) -> np.ndarray:
+        """The measured points of an entry of `returns`, not a number without a return, (N, 3) [m]."""
+        one = self.returns[number]
+        return one.rays.origin_m + one.range_m[:, None] * one.rays.direction
+
+    def cloud(self, number: int) -> np.ndarray:
+        """The table of all rays of an entry of `returns`: `COLUMNS`.
+
+        `t` is since the frame began [ns], `ring` the sensor, `outcome` a number of `Outcome`; `occluder` is 1 where the
+        first thing on the ray is no target, as the robot itself. Intensity is 1 for every return: it is not simulated.
+        """
+        one, table = self.returns[number], np.zeros(len(self.returns[number].rays), dtype=list(COLUMNS))
+        hits = SceneCaster(self.scene, one.frame).first_hit(one.rays.origin_m, one.rays.direction)
+        is_target = np.array([body.is_target for body in self.scene.bodies])
+        columns = {
+            **dict(zip("xyz", self.points_m(number).T, strict=True)),
+            "intensity": one.returned,
+            "t": np.round(NANOSECONDS * one.rays.time_s),
+            "ring": one.rays.sensor,
+            "outcome": one.outcome,
+            "occluder": (hits.body >= 0) & ~is_target[hits.body],
+            "ray": np.arange(len(table)),
+        }
+        for name, column in columns.items():
+            table[name] = column
+        return table
+
+    def unseen(self) -> tuple[np.ndarray, np.ndarray]:
+        """Triangles of the targets that no sensor sees in any frame, where they are in the first frame.
+
+        A triangle is seen where its middle lies in a sensor's field of view and gate with nothing in between.
+
+        Returns:
+            Vertices (V, 3) [m] and faces (F, 3).
+        """
+        casters, vertices, faces = build_casters(self.scene), [], []
+        bounds_m = scene_bounds(self.scene, 0, [one.rays for one in self.returns])
+        for number, body in enumerate(self.scene.bodies):
+            if not body.is_target:
+                continue
+            corners, triangles = own_triangles(body, body.pose(), bounds_m)
+            seen = np.zeros(len(triangles), dtype=bool)
+            for caster, pose in ((one, body.pose(frame)) for frame, one in enumerate(casters)):
+                middle = (corners @ pose[:3, :3].T + pose[:3, 3])[triangles].mean(axis=1)
+                extent = 0.0 if isinstance(body.shape, Mesh) else float(np.ptp(corners, axis=0).max())
+                for sensor in self.design.sensors:
+                    seen |= _seen_by(sensor, caster, number, middle, ROUND_SHARE * extent)
+            pose, own = body.pose(), triangles[~seen]
+            faces.append(own + sum(map(len, vertices)))
+            vertices.append(corners @ pose[:3, :3].T + pose[:3, 3])
+        if not faces:
+            return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int32)
+        used, compact = np.unique(np.concatenate(faces), return_inverse=True)
+        return np.concatenate(vertices)[used], compact.reshape(-1, 3).astype(np.int32)
+
+
+def _seen_by(sensor: Sensor, caster: SceneCaster, body: int, middle_m: np.ndarray, slack_m: float) -> np.ndarray:
+    """Mask of points of a body, (N, 3) [m], that a sensor sees."""
+    away = middle_m - sensor.origin_m
+    distance_m = np.linalg.norm(away, axis=1)
+    seen = (sensor.gate_m[0] <= distance_m) & (distance_m < sensor.gate_m[1]) & (distance_m > 0)
+    looking = away[seen] / distance_m[seen, None]
+    inside = (np.abs(sensor.tangent_of(looking)) <= np.array(sensor.field_of_view_rad) / 2 + ROUNDING).all(axis=1)
+    seen[seen] = inside
+    looking = looking[inside]
+    hits = caster.first_hit(np.broadcast_to(sensor.origin_m, looking.shape), looking)
+    near = distance_m[seen] - slack_m - ROUNDING * distance_m[seen]
+    seen[seen] = (hits.body == body) & (hits.range_m >= near)
+    return seen
+
+
+@dataclass(frozen=True)
+class Measuring:
+    """How a design measures.
+
+    Arguments:
+        detector: The name of a detector, or its file.
+        effects: auto, all, none, or names of effects between commas.
+        seed: Root of the scenes and of the effects' random numbers; None: the run's.
+    """
+
+    detector: str = "ideal"
+    effects: str = "auto"
+    seed: int | None = None
+
+    def planner(self) -> Planner:
+        """The rule by which effects are chosen."""
+        detector = load_detector(self.detector)
+        return Planner(detector, parse_effects(self.effects), Tolerance.of(detector))
+
+
+@phase("simulation")
+def seen_scenes(
+    run: RunFolder, design: DesignSpec, count: int, scenes: int, measuring: Measuring, settings: Sequence[str] = ()
+) -> list[SeenScene]:
+    """What a design sees in the first held-out scenes of a run, as `evaluate` simulates it.
+
+    Arguments:
+        run: The run.
+        design: The design.
+        count: Rays per frame.
+        scenes: How many scenes.
+        measuring: How it measures.
+        settings: Keys of the task with values, for scenes other than the learned ones.
+    """
+    config = with_task_settings(run.task, run.config, settings) if settings else run.config
+    run, planner = replace(run, config=config), measuring.planner()
+    seed = config.seed if measuring.seed is None else measuring.seed
+    request = EvaluationRequest(
+        task=run.task, config=config.task, space=config.space, seed=seed, designs=[design], rays=[count], baselines=(),
+        equal_bandwidth=False, test=run.scenes("test", seed),
+        planner=replace(planner, tolerance=planner.tolerated.within(run.metric)),
+    )  # fmt: skip
+    entry = entries_of(request)[0]
+    return [
+        _seen(design, scene, entry.lit_in(number), request.planner, seed)
+        for number, scene in enumerate(request.test[:scenes])
+    ]
+
+
+@phase("simulation")
+def seen_in_file(scene: Scene, design: DesignSpec, count: int, measuring: Measuring) -> SeenScene:
+    """What a design sees in a scene of a user's own; arguments as of `seen_scenes`."""
+    planner = measuring.planner()
+    fired = with_part_light(design.rays(count), design, planner.detector)
+    return _seen(design, scene, (fired,), planner, measuring.seed or 0)
+
+
+def _seen(design: DesignSpec, scene: Scene, positions: RaysPerCondition, planner: Planner, seed: int) -> SeenScene:
+    casters = build_casters(scene)
+    plan = planner.plan(scene, list(positions), casters)
+    found = returns_in_scene(scene, positions, casters, planner.physics(plan, seed))
+    return SeenScene(design, scene, found, tuple(sorted(plan.effects)))
+
+
+def scene_of_file(path: Path, mount: str | None, scale: float = 1.0) -> Scene:
+    """A scene of a user's file: a mesh, or a MuJoCo model in its initial configuration; everything is a target.
+
+    Arguments:
+        path: The file.
+        mount: The body of the model in whose frame the design is; None: the world.
+        scale: Factor from a mesh's unit to metres.
+
+    Raises:
+        DataError: The file cannot be read.
+    """
+    if path.suffix.lower() in SUFFIXES:
+        return Scene((Body(load_mesh(path, scale=scale), path.stem),), path.stem)
+    from lidardesign.scenes.mujoco_models import body_poses, load_model, visible_geoms
+
+    model, _ = load_model(path)
+    poses = body_poses(model, model.qpos0)
+    if mount is not None:
+        names = [model.body(number).name for number in range(model.nbody)]
+        if mount not in names:
+            allowed = ", ".join(filter(None, names))
+            raise DataError(f"has no body {mount!r}, which the design is mounted on", where=str(path), allowed=allowed)
+        poses = inverse_rigid(poses[:, names.index(mount)])[:, None] @ poses
+    return Scene(tuple(geom.at(poses) for geom in visible_geoms(model)[0]), path.stem)
