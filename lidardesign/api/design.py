@@ -278,6 +278,23 @@ class Design(DesignSource):
             ConfigError: An unknown choice, or no run to take scenes from.
             DataError: The file of the scene cannot be read.
         """
+        choices: dict[str, Any] = {"detector": detector, "effects": effects, "settings": settings, "seed": seed}
+        return self.seen(scene, scenes=scenes, rays=rays, scale=scale, notes=notes, **choices)
+
+    def seen(
+        self,
+        scene: Path | str | None,
+        *,
+        scenes: int,
+        rays: int | None,
+        detector: str,
+        effects: str,
+        settings: Sequence[str] | Mapping[str, Any],
+        seed: int | None,
+        scale: float,
+        notes: Notes,
+    ) -> list[SeenScene]:
+        """As `simulate`, with errors in terms of command-line options."""
         from lidardesign.clouds.seen import Measuring, scene_of_file, seen_in_file, seen_scenes
 
         check_number(scenes, "--scenes", 1, MOST_SCENES, whole=True)

@@ -125,9 +125,9 @@ def _wider_run(request: FitRequest, conflicts: Sequence[str]) -> str | None:
     run = request.run
     origins = [rules.origin for rules in request.constraints.rules]
     singles = [place for one in origins for place in (one.fixed_m, one.low_m, one.high_m) if place is not None]
-    places = np.array([*singles, *(place for one in origins for place in one.mounts_m or ())]).reshape(-1, 3)
     ends = np.stack([run.config.space.low[:3], run.config.space.high[:3]])
-    wider = np.stack([np.minimum(ends[0], places.min(axis=0)), np.maximum(ends[1], places.max(axis=0))])
+    places = np.stack([*ends, *singles, *(place for one in origins for place in one.mounts_m or ())])
+    wider = np.stack([places.min(axis=0), places.max(axis=0)])
     grown = [axis for axis in range(3) if (wider != ends)[:, axis].any()]
     if not grown:
         return None

@@ -65,7 +65,7 @@ def simulate(
             raise ConfigError(f"{target} has {len(designs)} designs", where="RUN|DESIGN", allowed=f"one of {names}")
         announce([out], output)
         check_outputs({"--out": out}, [scene] if scene else [], () if format_ == "mcap" else ("--out",))
-        seen = designs[0].simulate(
+        seen = designs[0].seen(
             scene, scenes=scenes, rays=rays, detector=detector, effects=effects, settings=overrides or (), seed=seed,
             scale=scale, notes=output.remark,
         )  # fmt: skip
