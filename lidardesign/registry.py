@@ -321,7 +321,7 @@ def check_interface(name: str, task: Any) -> None:
         )
     for member, kind in (("name", str), ("summary", str), ("metric", Metric), ("defaults", Defaults)):
         if not isinstance(getattr(task, member, None), kind):
-            raise PluginError(f"its {member} is no {kind.__name__}", where=f"task {name}", hint=AUTHOR_HINT)
+            raise PluginError(f"its {member} is not of type {kind.__name__}", where=f"task {name}", hint=AUTHOR_HINT)
     if not (isinstance(getattr(task, "Config", None), type) and issubclass(task.Config, TaskConfig)):
         raise PluginError("its Config is not a subclass of TaskConfig", where=f"task {name}", hint=AUTHOR_HINT)
     for member in ("space", "scenes", "score"):

@@ -115,7 +115,9 @@ class RunFolder:
         if came:
             more = f" and {len(came) - MOST_NAMED} more" if len(came) > MOST_NAMED else ""
             named = ", ".join(came[:MOST_NAMED]) + more
-            notes.append(f"{named} came since {self.folder} was learned: left out; learn again to take in what is new")
+            notes.append(
+                f"{named}: added after {self.folder} was learned, so left out; learn again to include what is new"
+            )
         return notes
 
     def design_paths(self) -> list[Path]:

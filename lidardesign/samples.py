@@ -30,7 +30,7 @@ DAMAGED_HINT = "learn the run again"
 BOUNDS: dict[str, tuple[float, float, float]] = {"good": (0.25, 0.5, 0.2), "usable": (0.5, 2.0, 0.05)}
 # Advice for a better density, by the preset that it was learned with.
 NEXT = {"draft": "--preset standard learns longer", "standard": "--preset fine learns longer"}
-LAST = "more learning.steps to a smaller learning.misplaced; a smaller space or a larger density.sigma_m learn faster"
+LAST = "raise learning.steps and lower learning.misplaced; a smaller space or a larger density.sigma_m learns faster"
 
 
 @dataclass(frozen=True, eq=False)

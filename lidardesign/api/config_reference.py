@@ -50,7 +50,7 @@ HEAD = """\
 Configuration of the task {name}: {summary}
 Scored by {metric} [{unit}], {better} is better.
 
-Lines that begin with {off}KEY have the default: take the {off} away to set them. What is left out keeps its default.
+Lines that begin with {off}KEY show the default: remove the {off} to set them. Keys left out keep their defaults.
 Use it as: lidardesign learn --config FILE"""
 SPACE_WORDS = "bounds [LOW, HIGH] of every dimension, or one number that fixes it; they follow from the task"
 DIMENSION_WORDS = {"condition": "dimensions that are given, not designed", "measure": "solid_angle or angles"}

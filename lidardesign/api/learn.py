@@ -382,7 +382,7 @@ def _holds_run(folder: Path) -> bool:
         hint = "move or remove it"
         if not folder.exists():
             hint = f"the new run is finished: mv {quote(str(next_to(folder, NEW)))} {quote(str(folder))}"
-        raise ConfigError("is left of a replacement that was killed", where=str(aside), hint=hint)
+        raise ConfigError("is left over from a replacement that was killed", where=str(aside), hint=hint)
     if not folder.is_dir() or _was_killed_before_it_began(folder):
         return False
     if not (folder / MANIFEST).is_file():

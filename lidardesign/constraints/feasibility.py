@@ -87,7 +87,7 @@ def check_feasible(
         # Mounts are alternatives to a fixed origin, inside the design space and the box
         name = rules.path("origin.mounts_m")
         if rules.origin.mounts_m is not None and rules.origin.fixed_m is not None:
-            _refuse("an origin is fixed, or at one of several mounts", [rules.path("origin.fixed_m"), name])
+            _refuse("an origin is either fixed or at one of several mounts", [rules.path("origin.fixed_m"), name])
         for number, mount in enumerate(rules.origin.mounts_m or []):
             for axis, value in enumerate(mount):
                 lows, highs = _origin_limits(rules, axis, space)

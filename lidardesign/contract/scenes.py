@@ -67,7 +67,7 @@ def check_repeatable(subject: Subject) -> LawHolds:
                     f"the second time the split {split} has a different scene {number} ({one.name!r})",
                     hint="draw all random numbers from lidardesign.task.random_generator(seed, ...)",
                 )
-    return LawHolds("made twice, the same to the bit")
+    return LawHolds("made twice, bit for bit the same")
 
 
 def check_seeds(subject: Subject) -> LawHolds | NotApplicable:
@@ -112,7 +112,7 @@ def check_elsewhere(subject: Subject) -> LawHolds | NotApplicable:
                 f"another process makes a different scene {number} of the split {split}",
                 hint="do not use hash(), the order of sets, the time or the process in scenes",
             )
-    return LawHolds("another process makes them the same to the bit")
+    return LawHolds("another process makes them bit for bit the same")
 
 
 def fingerprints_in_process(config: RunConfig, kind: type, seconds: float) -> dict[str, list[str]]:
@@ -216,7 +216,7 @@ def check_config(subject: Subject) -> LawHolds:
     if taken:
         raise BrokenLawError(f"takes NaN for {taken[0]!r}", hint="keep allow_inf_nan=False of TaskConfig")
     if again.model_dump() != config.model_dump():
-        raise BrokenLawError("values change on the way through JSON, in which runs are kept")
+        raise BrokenLawError("values change in a round trip through JSON, in which runs are kept")
     mute = [name for name, info in kind.model_fields.items() if not info.description]
     if mute:
         raise BrokenLawError(

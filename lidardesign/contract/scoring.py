@@ -133,7 +133,7 @@ def check_repeats(subject: Subject) -> LawHolds:
         first, again = subject.score(scene, returns), subject.score(scene, returns)
         if fingerprint(first) != fingerprint(again):
             raise BrokenLawError(f"scene {scene.name!r}: {first.value!r}, then {again.value!r} for the same returns")
-    return LawHolds("scored twice, the same to the bit")
+    return LawHolds("scored twice, bit for bit the same")
 
 
 def check_untouched(subject: Subject) -> LawHolds:
@@ -168,12 +168,12 @@ def check_information(subject: Subject) -> LawHolds | NotApplicable:
         if len(silent.ray) or (silent.harm is not None and np.any(silent.harm)):
             raise BrokenLawError(f"{said}: rays without a return have worth or harm")
         if not np.stack([one.returned for one in first])[found.source, found.ray].all():
-            raise BrokenLawError(f"{said}: a ray has worth by a frame in which it has no return")
+            raise BrokenLawError(f"{said}: a ray has worth from a frame in which it has no return")
         one, two = _pairs(found, np.sort(order)), _pairs(reordered, order)
         if len(np.unique(one[:, :3], axis=0)) < len(one):
             raise BrokenLawError(f"{said}: a pair of an item and a ray is given twice")
         if one.shape != two.shape or not np.allclose(one, two, rtol=SLACK, atol=0):
-            raise BrokenLawError(f"{said}: rays in another order are worth something else")
+            raise BrokenLawError(f"{said}: the worth of rays changes with their order")
         pairs, rays = pairs + len(one), rays + len(order)
         _check_features(subject, scene, first, other)
     if not rays:

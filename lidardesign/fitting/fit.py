@@ -361,13 +361,13 @@ class Fitter:
                 design = self._if_better(replace(design, adaptive=chosen.adaptive), notes)
             if chosen.silent > MOST_SILENT:
                 notes.append(
-                    f"about {chosen.silent:.0%} of the training scenes that were held back, no ray tells anything; "
-                    "where that is not expected, check that places, directions and gates are right, and in metres"
+                    f"no ray tells anything about {chosen.silent:.0%} of the training scenes that were held back; "
+                    "if that is unexpected, check that places, directions and gates are right, and in metres"
                 )
             if chosen.shared < LEAST_SHARED:
                 notes.append(
-                    f"constraints let several sensors see {chosen.shared:.0%} of what they see together: the rest is "
-                    "lost with its sensor; allow wider fields of view or gates"
+                    f"constraints let several sensors see only {chosen.shared:.0%} of what is seen: the rest is lost "
+                    "with its sensor; allow wider fields of view or gates"
                 )
         elif fitted.rays is not None:
             design = replace(design, constraints=merged(design.constraints, {"budget": {"rays": fitted.rays}}))
@@ -383,9 +383,7 @@ class Fitter:
 
         metric, adaptive = self.request.run.metric, design.adaptive
         if adaptive is None:
-            notes.append(
-                "one pattern: training scenes are too few or too much alike for several, or bandwidth is too short"
-            )
+            notes.append("one pattern: training scenes are too few or too similar for several, or bandwidth is too low")
             return design
         with phase("trials"):
             fixed = trial_of(self.request, design, len(adaptive))

@@ -154,12 +154,12 @@ def check_goal(layout: LayoutName, constraints: Constraints, run: RunFolder, opt
         ("a goal for sensors that spin", "--goal", "the layouts chosen and even"): (
             goal is not None and layout == "spinning"
         ),
-        ("a goal for patterns that follow what they see", "--adaptive", "one of both"): (
+        ("a goal for patterns that follow what they see", "--adaptive", "one of the two"): (
             goal is not None and (options.adaptive or 1) > 1
         ),
-        (f"{least} of a design of parts", "--least", "parts"): are_parts and least not in (None, "parts"),
+        (f"{least} with a design of parts", "--least", "parts"): are_parts and least not in (None, "parts"),
         ("no parts are named", "--least parts", "--parts NAME,NAME"): not are_parts and least == "parts",
-        (f"{options.sensors} sensors, of which the least are sought", "--sensors", "sensors.max, or nothing"): (
+        (f"{options.sensors} sensors with --least sensors", "--sensors", "sensors.max, or nothing"): (
             least == "sensors" and isinstance(options.sensors, int)
         ),
     }

@@ -139,7 +139,7 @@ def choose_parts(
     sign = 1.0 if request.run.metric.better == "lower" else -1.0
     winner = min(found, key=lambda one: sign * one.scores[: min(len(one.scores) for one in found)].sum())
     if len(winner.members) < count and not request.fewest:
-        notes(f"{len(winner.members)} of {count} parts: no further part tells more or fits the bounds")
+        notes(f"{len(winner.members)} of {count} parts: no other part adds anything or fits the bounds")
     parts = [placed[member].part for member in winner.members]
     for line in (*_price_notes(parts), *_place_notes(winner.design), *reach_notes(winner.design)):
         notes(line)
@@ -199,7 +199,7 @@ def _place_notes(design: DesignSpec) -> list[str]:
     several = [" and ".join(names) for names in here.values() if len(names) > 1]
     if not several:
         return []
-    return [f"{'; '.join(several)} stand at one place: one mount for several, or list places in origin.mounts_m"]
+    return [f"{'; '.join(several)} stand in the same place: mount them together, or list places in origin.mounts_m"]
 
 
 def _price_notes(parts: Sequence[Part]) -> list[str]:

@@ -288,13 +288,13 @@ def _check_conditions(constraints: Constraints, space: DesignSpace) -> None:
         raise ConfigError(f"{' and '.join(names)} are open, and rays follow one condition", where="--at", hint=hint)
     for name in names:
         if name not in TRAVELLED:
-            raise ConfigError(f"rays follow where sensors stand, and {name} says no place", where="--at", hint=hint)
+            raise ConfigError(f"rays follow where sensors stand, but {name} is not a place", where="--at", hint=hint)
         axis = DIMENSIONS.index(name)
         for rules in constraints.rules:
             low, high = origin_box(rules, space)
             if is_mounted([rules]) or low[axis] > space.low[axis] or high[axis] < space.high[axis]:
                 raise InfeasibleError(
-                    f"sensors follow {name} from {space.low[axis]:g} to {space.high[axis]:g}, and origin bounds it",
+                    f"sensors follow {name} from {space.low[axis]:g} to {space.high[axis]:g}, but origin bounds it",
                     conflicts=[rules.path("origin"), name],
                     hint=hint,
                 )
@@ -334,7 +334,7 @@ def _with_parts(options: FitOptions, asked: Constraints | None, run: RunFolder) 
         "parts together with --at or --weight": options.at or options.weights,
         "parts together with each, which bounds single sensors": asked.each,
         f"parts in the layout {options.layout}": options.layout,
-        "parts with --gates: parts have the gates that they have": options.gates,
+        "parts with --gates: a part's gates are fixed": options.gates,
         f"the task {run.task.name} has no method informs": not informs_rays(run.task),
     }
     for fault, is_found in lacking.items():

@@ -317,7 +317,7 @@ class GoalSearch:
         text += f"{len(found.trial.scores)} training scenes held back"
         cheaper = [one for one in self.tried if one.cost < found.cost]
         if cheaper:
-            text += f"; the next cheaper of those tried, {max(cheaper, key=lambda one: one.cost).text(metric)}"
+            text += f"; the next cheaper one tried: {max(cheaper, key=lambda one: one.cost).text(metric)}"
         tried = dict.fromkeys(one.text(metric) for one in self.tried)
         return [text, BackgroundNote(f"tried: {'; '.join(tried)}")]
 

@@ -56,8 +56,8 @@ XML_BEGINNINGS = (b"<", b"\xff\xfe<\x00", b"\xfe\xff\x00<")
 UTF16_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 # A mapping of YAML begins with a key, a document mark or a brace.
 YAML_LINE = re.compile(r"(---|[{%\[]|- |['\"]?[A-Za-z_][\w ]*['\"]?\s*:(\s|$))")
-SEPARATORS = {";": "; (a semicolon)", "\t": "tabs", "|": "| (a stroke)"}
-HEADER_HINT = "as in origin_x_m,origin_y_m,origin_z_m,azimuth_deg,elevation_deg,gate_start_m,gate_end_m"
+SEPARATORS = {";": "; (a semicolon)", "\t": "tabs", "|": "| (a vertical bar)"}
+HEADER_HINT = "name the columns: origin_x_m,origin_y_m,origin_z_m,azimuth_deg,elevation_deg,gate_start_m,gate_end_m"
 
 
 @phase("designs")
@@ -75,7 +75,7 @@ def load_design(path: Path, reach_m: float | None = None) -> DesignSpec:
         ConfigError: The file is not YAML, or not a design (exit 2).
     """
     path = Path(path)
-    head = read_head(path, RAY_TABLE, hint="give a design file, as RUN/designs/NAME.yaml")
+    head = read_head(path, RAY_TABLE, hint="give a design file, such as RUN/designs/NAME.yaml")
     rig = read_rig(path, head)
     if rig is not None:
         return rig_design(rig, path, reach_m)

@@ -198,7 +198,7 @@ def plan(design: DesignSpec, rays: Rays) -> list[Position]:
         places = len(np.unique(place[rays.sensor == index]))
         if places > 1:
             raise ConfigError(
-                f"the rays of sensor {sensor.name!r} start at {places} places, and a steering mirror stands at one",
+                f"the rays of sensor {sensor.name!r} start at {places} places, but a steering mirror stands at one",
                 where=design.name,
                 allowed="one origin per sensor",
                 hint="lidardesign constrain RUN without origin.spread_m, or with origin.fixed_m in the constraints",
@@ -263,7 +263,7 @@ def _refuse_far_rays(design: DesignSpec, rays: Rays, positions: list[Position]) 
         f"y = {y:.2f} degrees from the middle of the rays (ray {ray[worst]}, sensor {sensor!r})",
         where=design.name,
         allowed=f"+-{LIMIT_DEG:g} degrees of optical scan angle per axis",
-        hint="constrain field_of_view and boresight, as boresight.elevation_deg.max=20, or fewer sensors apart",
+        hint="constrain field_of_view and boresight (such as boresight.elevation_deg.max=20), or use fewer sensors",
     )
 
 

@@ -191,7 +191,7 @@ def read_mjcf(path: Path) -> Rig:
     groups = _groups(rays)
     notes = []
     if any(ray.start_m is None for ray in rays):
-        notes.append("the file does not say where gates start: rangefinders listen from 0 m on")
+        notes.append("the file does not say where gates start: rangefinders listen from 0 m")
     sensors_of_body = Counter(rays[group[0]].body for group in groups)
     sensors = []
     for group in groups:

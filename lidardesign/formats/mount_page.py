@@ -135,11 +135,11 @@ def write_mounts(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     notes = write_folder(path, files)
     regions = [one.sensor.region_m for one in mounted if one.sensor.region_m > 0]
     if regions:
-        notes.append(f"rays of {len(regions)} sensors start all over regions: the page has their middles")
+        notes.append(f"rays of {len(regions)} sensors start anywhere in a region: the page gives its middle")
     missing = [one.name for one in mounted if one.part is None and one.sensor.part is not None]
     if missing:
         notes.append(
-            f"the part files of {', '.join(missing)} are not at hand: poses are of the middles of their fields"
+            f"the part files of {', '.join(missing)} are not available: poses are those of the middles of their fields"
         )
     return [*notes, "sensors only: rays are lost; --format csv lists them"]
 

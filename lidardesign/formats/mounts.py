@@ -136,7 +136,7 @@ def origin_losses(mounted: Sequence[Mount]) -> list[str]:
         return []
     rays, worst = sum(len(one.ray) for one in spread), max(one.spread_m for one in spread)
     return [
-        f"{rays} rays of {len(spread)} sensors start all over them: they start at their middle, up to {worst:.3g} m off"
+        f"{rays} rays of {len(spread)} sensors start beside their sensor's middle: moved there, by up to {worst:.3g} m"
     ]
 
 

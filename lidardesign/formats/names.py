@@ -61,9 +61,9 @@ def renamed_note(names: Sequence[str], written: Sequence[str]) -> list[str]:
     changed = [(old, new) for old, new in zip(names, written, strict=True) if old != new]
     if not changed:
         return []
-    shown = ", ".join(f"{old!r} is {new}" for old, new in changed[:QUOTED])
+    shown = ", ".join(f"{old!r} became {new}" for old, new in changed[:QUOTED])
     more = f", and {len(changed) - QUOTED} more" if len(changed) > QUOTED else ""
-    return [f"names there are letters, digits and underscores: {shown}{more}"]
+    return [f"names there hold only letters, digits and underscores: {shown}{more}"]
 
 
 def xml_text(text: str) -> str:

@@ -105,7 +105,7 @@ def rig_of_columns(columns: RayColumns, kind: str) -> Rig:
     azimuth, elevation = _angles(columns)
     unsaid = {
         ORIGIN[0]: "the file does not say where rays start: all start at the world's origin",
-        START: "the file does not say where gates start: rays listen from 0 m on",
+        START: "the file does not say where gates start: rays listen from 0 m",
     }
     notes = [note for name, note in unsaid.items() if name not in columns.numbers]
     usual = {name: np.zeros(len(azimuth)) for name in (*ORIGIN, START)}

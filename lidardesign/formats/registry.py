@@ -76,7 +76,7 @@ class Exporter:
             raise ConfigError(
                 f"{self.name} cannot hold patterns that follow what they see",
                 where="--format",
-                allowed=f"with them {', '.join(name for name, exporter in EXPORTERS.items() if exporter.following)}",
+                allowed=f"with {', '.join(name for name, exporter in EXPORTERS.items() if exporter.following)}",
                 hint="lidardesign constrain DESIGN --adaptive 1 makes the best single pattern",
             )
         if robot is not None and not self.robotic:

@@ -135,7 +135,7 @@ def rig_design(rig: Rig, path: Path, reach_m: float | None) -> DesignSpec:
         )
     if unknown:
         notes.append(
-            f"the file does not say how far {unknown} of {total} rays reach; {reach_m:g} m, as far as any may be"
+            f"the file does not say how far {unknown} of {total} rays reach; set to {reach_m:g} m, the farthest allowed"
         )
     gated = []
     for one in rig.sensors:

@@ -316,7 +316,7 @@ def _gate(element: ElementTree.Element, scope: Scope, notes: dict[str, None]) ->
         if child is not None and not infinite:
             bounds[tag] = numbers_of(child.text, 1, scope.where(child), tag)[0]
     if element.find("min") is None:
-        notes["the file does not say where gates start: rays listen from 0 m on"] = None
+        notes["the file does not say where gates start: rays listen from 0 m"] = None
     if not 0 <= bounds["min"] <= bounds["max"]:
         raise DataError(
             f"range from {bounds['min']:g} to {bounds['max']:g} m",

@@ -192,7 +192,7 @@ def _module(name: str) -> Part:
     found = MODULE.fullmatch(name)
     if found is None:
         raise ConfigError(
-            f"{name!r} is no module",
+            f"{name!r} does not describe a module",
             where="parts",
             allowed="a field of view in degrees and a number of zones, each across x up: --fov 45x45 --zones 8x8",
         )

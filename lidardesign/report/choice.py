@@ -23,9 +23,9 @@ FEWEST_POINTS = 4  # of a rank correlation that says anything
 FIGURE_PX = 320
 LEFT_PX = 78  # small losses have long labels
 EXPLAINED = (
-    "Loss is what the chosen rays leave unknown of training scenes, by what the task says that returns tell: a proxy, "
-    "not the score. No choice of as many of these candidates, through their gates and for no more bandwidth, has a "
-    "loss that is less by more than the certificate says."
+    "Loss is what the chosen rays leave unknown about training scenes, by what the task says returns tell: a proxy, "
+    "not the score. No other choice of as many of these candidates, with the same gates and no more bandwidth, could "
+    "lower the loss by more than the certificate says."
 )
 Points = Sequence[tuple[float, float]]
 
@@ -87,8 +87,8 @@ def correlation_sentence(pairs: Points, evaluation: Evaluation) -> str:
     sign = 1 if evaluation.metric.better == "lower" else -1
     correlation = float(spearmanr(losses, sign * scores).statistic)
     return (
-        f"Proxy and score have a rank correlation (Spearman) of {correlation:.2f} over {len(pairs)} choices; 1 says "
-        "that they order them alike. More rays are better for both."
+        f"Proxy and score have a rank correlation (Spearman) of {correlation:.2f} over {len(pairs)} choices; 1 means "
+        "that both rank them alike. More rays are better for both."
     )
 
 
@@ -101,7 +101,7 @@ def _table(chosen: Mapping[str, Sequence[Mapping[str, Any]]], axis: str) -> str:
             cells.append(f"{100 * entry['gap']:.1f} %")
             cells += [str(entry[column]) for column in ("candidates", "gates", "scenes")]
             lines.append((cells, "", bool(index == 0 and lines)))
-    caption = "Rays chosen on training scenes, and how far from the best choice they are at most."
+    caption = "Rays chosen on training scenes, and how far they can be from the best choice."
     return folded("All certificates", table(headings, lines, text_columns=1, caption=caption), len(lines))
 
 

@@ -89,7 +89,7 @@ def mounting_table(evaluation: Evaluation) -> str:
         cells = [row.design, str(row.rays), *values, str(row.failures), four_digits(cost.difference), interval(cost)]
         begins = bool(index and row.design != mounting.rows[index - 1].design)
         lines.append(([*cells, ""], verdict(evaluation, cost), begins))
-    caption = f"Every sensor off by {mounting.error} per axis in every scene, against itself mounted exactly."
+    caption = f"Every sensor off by {mounting.error} per axis in every scene, against the design mounted exactly."
     return table(headings, lines, text_columns=1, caption=caption)
 
 
@@ -349,7 +349,7 @@ def effects_section(evaluation: Evaluation) -> str:
     head = (
         f"<p>The detector is {detector}. For each effect, the most that it could change in any scene and row: errors "
         f"of range (rms) and the share of returns lost, invented or misplaced. Together, skipped effects may change "
-        f"{MILLIMETRES * tolerance.range_m:.3g} mm and {tolerance.lost:.2g} of the returns together.</p>"
+        f"{MILLIMETRES * tolerance.range_m:.3g} mm and {tolerance.lost:.2g} of the returns.</p>"
     )
     headings = ["effect", "simulated", "reason", "range [mm]", "returns", "cost [s]"]
     caption = "The plan of effects: what was simulated, why, and what it costs."

@@ -207,7 +207,7 @@ def silent_notes(scenes: Sequence[Scene], fired: Mapping[str, RaysPerCondition])
         if silent > MOST_SILENT * len(watched):
             notes.append(
                 f"in {silent} of {len(watched)} frames that were checked, no ray of {name} returns from a target; "
-                "where that is not expected, check that its places, directions and gates are right, and in metres"
+                "if that is unexpected, check that its places, directions and gates are right, and in metres"
             )
     return notes
 

@@ -147,7 +147,7 @@ def outside_notes(design: DesignSpec, space: DesignSpace) -> list[str]:
         return [f"{design.name} stands {apart_m.max():.4g} m outside the run's design space; {unit}"]
     if len(starts_m) and starts_m.max() > FAR_SIZES * size_m:
         return [
-            f"{design.name} listens from {starts_m.max():.4g} m on, and the run's design space ends at "
+            f"{design.name} listens from {starts_m.max():.4g} m, but the run's design space ends at "
             f"{space.high[RANGE]:.4g} m; {unit}"
         ]
     return []

@@ -156,7 +156,7 @@ class DesignSpec:
             return replace(table.subset(np.sort(np.concatenate(chosen))), time_s=fire_times(count, DEFAULT_RATE_HZ))
         if self.counts is not None:
             raise ConfigError(
-                f"{count} rays, which were not chosen",
+                f"no choice of {count} rays",
                 where=self.name,
                 allowed=", ".join(map(str, self.counts)),
                 hint=f"lidardesign fit RUN --rays {count}",

@@ -129,7 +129,7 @@ class PatternEntry(_Keys):
     @model_validator(mode="after")
     def _whole(self) -> PatternEntry:
         if (self.dimension is None) != (len(self.knots_m) < 2):
-            raise ValueError("knots_m has at least two values where there is a dimension, and else none")
+            raise ValueError("knots_m needs at least two values with a dimension, and none without")
         if any(after <= before for before, after in zip(self.knots_m, self.knots_m[1:], strict=False)):
             raise ValueError("knots_m does not ascend")
         rows, rays = max(len(self.knots_m), 1), len(self.sensor)
@@ -169,17 +169,17 @@ class AdaptiveEntry(_Keys):
         count, rays = len(self.centroids), {len(pattern.sensor) for pattern in self.patterns}
         if len(self.patterns) != count + 1 or len(self.shares) != count + 1:
             raise ValueError(
-                f"{count} centroids have {count + 1} patterns and shares, the first where nothing is known"
+                f"{count} centroids need {count + 1} patterns and shares, the first for when nothing is known"
             )
         if abs(math.fsum(self.shares) - 1) > COARSE_SLACK:
             raise ValueError("shares do not sum to 1")
         if len(rays) > 1 or any(pattern.dimension for pattern in self.patterns):
-            raise ValueError("patterns that follow what they see have equal numbers of rays, and no dimension")
+            raise ValueError("patterns that follow what they see need equal numbers of rays and no dimension")
         sizes = {len(centroid) for centroid in self.centroids}
         if len(sizes) > 1 or 0 in sizes or (self.looks and sizes != {self.looks}):
-            raise ValueError("centroids have one number for each feature: of a first look one for each of its rays")
+            raise ValueError("centroids need one number per feature, or with a first look one per ray of it")
         if len(self.missing_m) != self.looks or self.looks > min(rays):
-            raise ValueError("missing_m has a range for each ray of the first look, which every pattern begins with")
+            raise ValueError("missing_m needs a range for each ray of the first look, which every pattern begins with")
         for name in (*COLUMNS, "sensor"):
             begun = [row[: self.looks] for row in (_only_row(pattern, name) for pattern in self.patterns)]
             if any(one != begun[0] for one in begun):
@@ -216,7 +216,7 @@ class DesignFile(_Keys):
             raise ValueError(f"two sensors have the name {twice!r}")
         weights = [sensor.weight for sensor in self.sensors]
         if any(weight is None for weight in weights) and any(weight is not None for weight in weights):
-            raise ValueError("a sensor has a weight and another has none: give all weights or none")
+            raise ValueError("some sensors have a weight and others none: give all weights or none")
         if None not in weights and not 0 < sum(weights) < math.inf:
             raise ValueError("the weights of the sensors are all zero, or too large to sum")
         if (self.layout == "even") != (not self.patterns):
@@ -225,14 +225,14 @@ class DesignFile(_Keys):
             )
         sizes = [len(pattern.sensor) for pattern in self.patterns]
         if len(sizes) > 1 and (self.layout != "chosen" or sorted(set(sizes)) != sizes):
-            raise ValueError("several patterns are for the layout chosen, by ascending numbers of rays")
+            raise ValueError("several patterns need the layout chosen and ascending numbers of rays")
         if len({pattern.dimension for pattern in self.patterns}) > 1:
             raise ValueError("patterns follow different conditions")
         every = [*self.patterns, *(self.adaptive.patterns if self.adaptive else [])]
         if any(max(pattern.sensor) >= len(self.sensors) for pattern in every):
             raise ValueError(f"a pattern names a sensor beyond the last of {len(self.sensors)}, counted from 0")
         if self.adaptive is not None and len(self.adaptive.patterns[0].sensor) not in sizes:
-            raise ValueError("no pattern has as many rays as the adaptive ones: it is what fires without a rule")
+            raise ValueError("no pattern has as many rays as the adaptive ones: one is needed to fire without the rule")
         return self
 
 

@@ -155,7 +155,7 @@ def light_notes(design: DesignSpec, detector: Detector) -> list[str]:
     known = [name for name, part in kinds.items() if part_light(part, detector, part.rays) is not None]
     unknown = [name for name in kinds if name not in known]
     lines = [f"light as data sheets imply: {', '.join(known)}"] * bool(known)
-    own = f"no range that {detector.name} could keep in some light is stated of {', '.join(unknown)}: its own is taken"
+    own = f"no stated range sets the light of {', '.join(unknown)}: that of {detector.name} is used"
     return [*lines, *[own] * bool(unknown)]
 
 

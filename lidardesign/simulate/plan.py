@@ -281,7 +281,7 @@ def parse_effects(text: str) -> Choice:
     if names[0] in CHOICES and len(names) == 1:
         return names[0]  # type: ignore[return-value]
     if not all(names):
-        raise ConfigError(f"{text!r} has an empty name of an effect", where="--effects", allowed=allowed)
+        raise ConfigError(f"{text!r} has an empty effect name", where="--effects", allowed=allowed)
     for name in names:
         if name in WORDS:
             raise ConfigError(

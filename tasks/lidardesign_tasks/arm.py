@@ -90,7 +90,7 @@ class ArmTask:
         """
         if config.jitter_m == 0:
             raise ConfigError(
-                "without jitter all trajectories are nearly the same, so held-out ones would be known",
+                "without jitter all trajectories are nearly the same, so held-out ones would not be new",
                 where="task.jitter_m",
                 hint="set jitter_m above 0",
             )

@@ -112,7 +112,7 @@ def head_scenes(
     """
     if config.identity_scale == 0 and config.jitter_rotation_deg == 0 and config.jitter_translation_m == 0:
         raise ConfigError(
-            "without identities and pose jitter all heads are the same, so held-out ones would be known",
+            "without identities and pose jitter all heads are the same, so held-out ones would not be new",
             where="task.identity_scale",
             hint="set identity_scale, jitter_rotation_deg or jitter_translation_m above 0",
         )

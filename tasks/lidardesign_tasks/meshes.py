@@ -107,25 +107,25 @@ class MeshesConfig(FolderConfig, Importance):
     @model_validator(mode="after")
     def _contrast_of_colours(self) -> MeshesConfig:
         if self.importance != COLOURS and self.colour_contrast != type(self).model_fields["colour_contrast"].default:
-            raise ValueError("colour_contrast is that of importance=colours")
+            raise ValueError("colour_contrast needs importance=colours")
         return self
 
     @model_validator(mode="after")
     def _what_lies_in_a_pile(self) -> MeshesConfig:
         fields = type(self).model_fields
         if not self.clutter and (self.background, self.background_returns) != ("bin", "removed"):
-            raise ValueError("background is that of a pile: set clutter=N too")
+            raise ValueError("background is for a pile: set clutter=N too")
         alone = [key for key in ALONE if self.clutter and getattr(self, key) != fields[key].default]
         if alone:
-            raise ValueError(f"{alone[0]} is that of an object alone: leave it or clutter out")
+            raise ValueError(f"{alone[0]} is for a single object: remove it or clutter")
         return self
 
     @model_validator(mode="after")
     def _one_way_to_move(self) -> MeshesConfig:
         if self.motion is not None and self.speed_m_s:
-            raise ValueError("speed_m_s is that of objects without a motion: leave one of them out")
+            raise ValueError("speed_m_s is for objects without a motion: remove it or motion")
         if self.motion is None and self.frame_rate_hz != type(self).model_fields["frame_rate_hz"].default:
-            raise ValueError("frame_rate_hz is that of a motion: set motion=FILE.csv too")
+            raise ValueError("frame_rate_hz is for a motion: set motion=FILE.csv too")
         return self
 
 

@@ -87,7 +87,7 @@ def _check_bodies(paths: Mapping[str, BodyPath], path: Path, objects: list[str],
         if name == EVERY and objects:
             continue
         if len(called) != 1:
-            found = f"no mesh is called {name!r}" if not called else f"{name!r} is {' and '.join(called)}"
+            found = f"no mesh is called {name!r}" if not called else f"{name!r} names {' and '.join(called)}"
             allowed = ", ".join([EVERY, *every][:MOST_SHOWN]) + (", ..." if len(every) >= MOST_SHOWN else "")
             raise DataError(found, where=f"{path}:{one.line}", allowed=allowed, hint="name one mesh file, or * for all")
     for mesh in every:

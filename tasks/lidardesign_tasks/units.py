@@ -53,8 +53,8 @@ def doubtful_motion(bounds_m: Mapping[str, np.ndarray], extent_m: float, space: 
     if name is None or way_m[name] < max(DOUBTFUL_EXTENT_M, DOUBTFUL_WAY * extent_m):
         return []
     return [
-        f"motion: the way of {name} is {way_m[name]:.4g} m long, of objects that are {extent_m:.3g} m long, so sensors "
-        "lie far from them; its lengths are metres: is the CSV in millimetres?"
+        f"motion: the path of {name} is {way_m[name]:.4g} m long, for objects {extent_m:.3g} m long, so sensors "
+        "are far from them; lengths are in metres: is the CSV in millimetres?"
     ]
 
 
@@ -69,8 +69,8 @@ def doubtful_times(time_s: Mapping[str, np.ndarray]) -> list[str]:
     if name is None or steps_s[name] < DOUBTFUL_STEP_S:
         return []
     return [
-        f"{name}: its moments are {steps_s[name]:.4g} s apart; times are seconds: are they milliseconds or less? "
-        "Motion is even in between"
+        f"{name}: its rows are {steps_s[name]:.4g} s apart; times are in seconds: are they milliseconds or less? "
+        "Motion is uniform in between"
     ]
 
 

@@ -95,7 +95,7 @@ def test_scenes_are_those_that_were_learned_and_newcomers_are_named(place, chang
     assert (splits(run), run.metric) == (before, metric)
     notes = run.input_notes()
     assert len(notes) == (named is not None)
-    assert named is None or notes[0].startswith(f"{named} came since")
+    assert named is None or notes[0].startswith(f"{named}: added after")
 
 
 def test_as_long_as_nothing_changed_scenes_are_those_of_the_folder(place):
@@ -141,7 +141,7 @@ def test_every_command_keeps_them_and_learning_again_takes_newcomers_in(place, c
         ["evaluate", run / "designs" / "fit.yaml", "--rays", 4],
     ):
         result = lidardesign(*command)
-        assert (result.code, "z.stl came since" in result.err) == (0, True), result.err
+        assert (result.code, "z.stl: added after" in result.err) == (0, True), result.err
     opened = RunFolder.open(run)
     judged = with_task_settings(opened.task, opened.config, ["truth_points=200"])
     assert judged.task.inputs == opened.config.task.inputs
@@ -156,7 +156,7 @@ def test_a_run_that_is_resumed_keeps_them_too(place, tmp_path):
     notes = []
     request = LearnRequest.resolve("meshes", LearnOptions(out=run, resume=True), notes.append)
     assert request.settings.task.inputs == read_manifest(run)["inputs"]
-    assert any("z.stl came since" in note for note in notes)
+    assert any("z.stl: added after" in note for note in notes)
 
 
 def test_recordings_stay_on_their_side_too(tmp_path):

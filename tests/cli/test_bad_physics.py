@@ -53,7 +53,7 @@ CASES = [
     ("evaluate run --effects ALL", 2, "did you mean 'all'"),
     ("evaluate run --effects audit,all", 2, "'audit' cannot be combined with effects"),
     ("evaluate run --effects jitter,none", 2, "'none' cannot be combined with effects"),
-    ("evaluate run --effects jitter,", 2, "has an empty name of an effect"),
+    ("evaluate run --effects jitter,", 2, "has an empty effect name"),
     *(
         (f"evaluate run {option} {value}", 2, f"{option}: ")
         for option in ("--range-tolerance-mm", "--return-tolerance")

@@ -160,4 +160,4 @@ def test_a_rig_that_hears_only_far_beyond_the_space_is_told(flat):
     near = read_design(rig(flat, "near.csv", 1))
     far = read_design(rig(flat, "far.csv", 1, start=500.0))
     assert outside_notes(near, space) == []
-    assert "listens from 500 m on" in outside_notes(far, space)[0]
+    assert "listens from 500 m, but" in outside_notes(far, space)[0]

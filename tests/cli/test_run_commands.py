@@ -223,7 +223,7 @@ def test_a_run_says_what_it_has_and_what_can_be_done_next(lidardesign, finished)
     assert follow(lidardesign, shown) == ["fit"]
     lidardesign("fit", finished, "--layout", "even", "--sensors", 1)
     shown = lidardesign("show", finished).out
-    assert "no scores are kept yet" in shown
+    assert "no scores yet" in shown
     assert follow(lidardesign, shown) == ["evaluate"]
     scores = lidardesign("evaluate", finished, "--rays", 9, "--json").json
     shown = lidardesign("show", finished).out
@@ -273,5 +273,5 @@ def test_what_cannot_be_read_is_said_beside_what_can(lidardesign, finished):
     assert shown.code == 0
     assert "cut cannot be read: " in shown.out
     note(finished, learn={"seconds": "long", "steps": None}, scores={"fit": {"value": "many"}})
-    assert "no scores are kept yet" in lidardesign("show", finished).out
+    assert "no scores yet" in lidardesign("show", finished).out
     assert lidardesign("show", finished, "--at", "x_m=1").code == 2

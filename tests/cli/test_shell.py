@@ -45,7 +45,7 @@ def flat(fitted, tmp_path):
 def test_a_dash_is_no_file(lidardesign, flat):
     for arguments in ("show -", "learn --config -", f"evaluate {flat} --csv -"):
         result = lidardesign(*arguments.split())
-        assert (result.code, "'-' is no value" in result.err) == (2, True)
+        assert (result.code, "'-' is not a value" in result.err) == (2, True)
 
 
 def test_rays_go_to_a_device_whole(lidardesign, flat):

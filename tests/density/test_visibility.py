@@ -26,7 +26,7 @@ def test_a_visible_surface_does_not_hide_itself(name):
 
 def test_auto_casts_rays_where_something_is_in_the_way_and_says_what_it_chose_unless_that_was_decided_before():
     for bodies, name, said in (
-        ((wall(),), "off", "visibility off: of "),
+        ((wall(),), "off", "visibility off: "),
         ((wall(), plate(0.005, half=0.1)), "raycast", "visibility by ray casting: "),
     ):
         target, notes = prepare_target([Scene(bodies)], config_of("auto"))

@@ -329,8 +329,8 @@ MOVING = parse_yaml(GOOD, where="x").value["patterns"][0]
     [
         ("fixed", (), "at least one pattern"),
         ("chosen", (), "at least one pattern"),
-        ("fixed", (still(1), still(2)), "for the layout chosen"),
-        ("spinning", (still(1), still(2)), "for the layout chosen"),
+        ("fixed", (still(1), still(2)), "need the layout chosen"),
+        ("spinning", (still(1), still(2)), "need the layout chosen"),
         ("chosen", (still(2), still(1)), "ascending"),
         ("chosen", (still(2), still(2)), "ascending"),
         ("chosen", (still(1), MOVING), "different conditions"),

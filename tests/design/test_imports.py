@@ -658,7 +658,7 @@ def test_a_rig_scores_as_the_design_that_fires_its_rays(call, run, tmp_path):
         values = {row["design"]: row["value"] for row in result.json["rows"]}
         assert values["fans"] == values["same"]
         assert {row["rays"] for row in result.json["rows"]} == {count}
-        assert "the file does not say how far 16 of 16 rays reach; 1.2 m" in result.err
+        assert "the file does not say how far 16 of 16 rays reach; set to 1.2 m" in result.err
         assert any("subset" in note for note in result.json["notes"]) == bool(asked)
 
 

@@ -212,9 +212,9 @@ def test_keys_that_say_nothing_together_are_refused(tmp_path):
     for keys, words in (
         ({"background": "table"}, "set clutter=N too"),
         ({"background_returns": "stay"}, "set clutter=N too"),
-        ({"clutter": 2, "speed_m_s": 1.0}, "speed_m_s is that of an object alone"),
-        ({"clutter": 2, "motion": "a.csv"}, "motion is that of an object alone"),
-        ({"clutter": 2, "area_exponent": 1.0}, "area_exponent is that of an object alone"),
+        ({"clutter": 2, "speed_m_s": 1.0}, "speed_m_s is for a single object"),
+        ({"clutter": 2, "motion": "a.csv"}, "motion is for a single object"),
+        ({"clutter": 2, "area_exponent": 1.0}, "area_exponent is for a single object"),
     ):
         with pytest.raises(ValidationError, match=words):
             MeshesTask.Config(folder=tmp_path / "one", **keys)

@@ -116,7 +116,7 @@ BROKEN = {
         (SCORE, INFORMS.replace("returns[0].returned", "returns[0].range_m") + SCORE, "without a return have worth"),
         (SCORE, INFORMS.replace("np.flatnonzero(", "np.repeat(*np.where(").replace("turned)", "turned), 2)") + SCORE,
          "given twice"),
-        (SCORE, INFORMS.replace("np.ones(len(ray))", "1.0 + ray") + SCORE, "in another order are worth something else"),
+        (SCORE, INFORMS.replace("np.ones(len(ray))", "1.0 + ray") + SCORE, "worth of rays changes with their order"),
         (SCORE, INFORMS.replace("returns[0].returned", "[]") + SCORE, "rays at targets are worth nothing"),
     ],
     "no global random state": [

@@ -69,7 +69,7 @@ def list_(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """List all parts in all their modes. Pattern, field of view, range and what reading them costs are shown."""
+    """List all parts in all their modes. It shows pattern, field of view, range and the cost of reading them out."""
     with command(json=json, quiet=quiet) as output:
         with phase("libraries"):
             from lidardesign.parts.catalogue import load_library
@@ -128,7 +128,7 @@ def show(
         typer.Option(
             "--arrange",
             metavar="interleaved|beside",
-            help="Several parts see the same, with interleaved rays, or have fields of view side by side.",
+            help="Several parts share a field of view and interleave their rays, or have theirs side by side.",
             show_default="interleaved",
             autocompletion=options.words("interleaved|beside"),
         ),

@@ -36,7 +36,7 @@ def init(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Write a configuration file for TASK. Every key is there with its default, its bounds and what it is."""
+    """Write a configuration file for TASK. It lists every key with its default, bounds and meaning."""
     with command(json=json, quiet=quiet) as output:
         _check_new(out)
         with phase("libraries"):
@@ -60,9 +60,7 @@ def schema(
     ],
     task: Annotated[
         str | None,
-        typer.Option(
-            "--task", metavar="TASK", help="Of a configuration: with the keys of this task.", show_default=False
-        ),
+        typer.Option("--task", metavar="TASK", help="With config: include the keys of this task.", show_default=False),
     ] = None,
     out: Out = None,
     json: options.Json = False,

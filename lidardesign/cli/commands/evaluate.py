@@ -39,8 +39,8 @@ def evaluate(
         typer.Argument(
             metavar="RUN|DESIGN",
             readable=False,
-            help="Run folders (all their designs) and design files. Of runs that differ only in their seed, designs "
-            "of one name are one row, with intervals over seeds and scenes.",
+            help="Run folders (all their designs) and design files. For runs that differ only in their seed, "
+            "designs of the same name share a row, with intervals over seeds and scenes.",
         ),
     ],
     space_of: options.SpaceOf = None,
@@ -55,8 +55,8 @@ def evaluate(
             metavar="N",
             min=1,
             max=1_000_000,
-            help="Rays per frame and position; repeatable. Fixed patterns fire their own number, or where only fewer "
-            "are asked for an even subset.",
+            help="Rays per frame and position; repeatable. Fixed patterns fire their own number, or an even subset "
+            "where fewer are asked for.",
             show_default="the task's and those of fixed patterns",
         ),
     ] = None,

@@ -57,7 +57,7 @@ def export(
         typer.Option(
             "--robot",
             metavar="MODEL",
-            help="MuJoCo model that the sensors are put into (mjcf).",
+            help="MuJoCo model to put the sensors on (mjcf).",
             show_default="that of the run of a mounted design",
         ),
     ] = None,

@@ -52,7 +52,7 @@ def learn(
         typer.Option(
             "--device",
             metavar="auto|cpu|cuda",
-            help="Where the flow is trained; auto takes a GPU when there is one.",
+            help="Where to train the flow; auto uses a GPU if there is one.",
             autocompletion=words("auto|cpu|cuda"),
         ),
     ] = "auto",
@@ -71,7 +71,7 @@ def learn(
             "--tolerance",
             metavar="SHARE",
             help="Set learning.misplaced: learn until at most this share of the density's mass is in the wrong place; "
-            "exit 1 if all steps are not enough.",
+            "exit 1 if the steps run out first.",
             show_default=False,
         ),
     ] = None,
@@ -80,7 +80,7 @@ def learn(
         typer.Option(
             "--time-budget",
             metavar="SECONDS",
-            help="Take steps until this time has passed, however good the density is; measuring comes after.",
+            help="Learn for this long, however good the density is; measuring it takes extra time.",
             show_default=False,
         ),
     ] = None,

@@ -36,7 +36,9 @@ def show(
     ],
     other: Annotated[
         Path | None,
-        typer.Argument(metavar="OTHER", readable=False, help="A design: only what differs in it.", show_default=False),
+        typer.Argument(
+            metavar="OTHER", readable=False, help="Another design: show only what differs.", show_default=False
+        ),
     ] = None,
     at: options.At = None,
     space_of: options.SpaceOf = None,
@@ -153,9 +155,9 @@ def _show_summary(document: dict[str, Any], rich: RichConsole) -> None:
     for entry in (entry for entry in designs if "error" in entry):
         rich.print(f"{entry['name']} cannot be read: {entry['error']}", soft_wrap=True)
     if quality is not None and not scored:
-        rich.print("no scores are kept yet" if fine else "no designs yet")
+        rich.print("no scores yet" if fine else "no designs yet")
     if document["cache"]:
-        kept = "fits keep what training scenes show of rays: {path}, {megabytes:.1f} MB"
+        kept = "cached for later fits: {path}, {megabytes:.1f} MB"
         megabytes = document["cache"]["bytes"] / 1e6
         rich.print(kept.format(**document["cache"], megabytes=megabytes), soft_wrap=True)
     if document["next"]:

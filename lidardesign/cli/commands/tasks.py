@@ -121,7 +121,7 @@ def check(
     overrides: options.Overrides = None,
     seconds: Annotated[
         float,
-        typer.Option("--seconds", metavar="S", min=0.1, max=86_400, help="Longest time of one call of the task."),
+        typer.Option("--seconds", metavar="S", min=0.1, max=86_400, help="Longest time that one call may take."),
     ] = 60.0,
     seed: options.Seed = None,
     json: options.Json = False,

@@ -85,7 +85,7 @@ Seed = Annotated[
 ]
 Quiet = Annotated[
     bool,
-    typer.Option("--quiet", "-q", help="Print no notes and no progress; of a result in a file, only its path."),
+    typer.Option("--quiet", "-q", help="Print no notes or progress; for a result in a file, only its path."),
 ]
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Print everything: all tables and notes.")]
 Name = Annotated[str, typer.Option("--name", metavar="NAME", help="Name of the design: RUN/designs/NAME.yaml.")]
@@ -94,7 +94,7 @@ Layout = Annotated[
     typer.Option(
         "--layout",
         metavar="chosen|even|spinning",
-        help="Rays chosen on training scenes, even in the field of view, or on rings that are chosen.",
+        help="Rays chosen on training scenes, even in the field of view, or on chosen rings.",
         show_default="the design's, else chosen; even where rays cannot be chosen",
         autocompletion=words("chosen|even|spinning"),
     ),
@@ -125,7 +125,7 @@ Channels = Annotated[
         "--channels",
         metavar="N",
         min=1,
-        help="Channels of each sensor of the layout spinning: rings that are chosen.",
+        help="Channels (chosen rings) per sensor in the layout spinning.",
         show_default="the design's, else 16",
     ),
 ]
@@ -153,7 +153,7 @@ Sensors = Annotated[
     typer.Option(
         "--sensors",
         metavar="N|N-M|best",
-        help="Number of sensors; best: by the task's score on training scenes; N-M: of parts, a table and its best.",
+        help="Number of sensors; best: by the task's score on training scenes; N-M: of parts, a table and the best.",
         show_default="the design's, else best",
     ),
 ]
@@ -169,13 +169,14 @@ Parts = Annotated[
 ]
 Modules = Annotated[
     int | None,
-    typer.Option("--modules", metavar="N", help="So many modules with --fov and --zones.", show_default=False),
+    typer.Option("--modules", metavar="N", help="This many modules with --fov and --zones.", show_default=False),
 ]
 ModuleField = Annotated[
-    str | None, typer.Option("--fov", metavar="WxH", help="Of modules, degrees, as 45x45.", show_default=False)
+    str | None,
+    typer.Option("--fov", metavar="WxH", help="Module field of view in degrees, such as 45x45.", show_default=False),
 ]
 ModuleZones = Annotated[
-    str | None, typer.Option("--zones", metavar="CxR", help="Of modules, as 8x8.", show_default=False)
+    str | None, typer.Option("--zones", metavar="CxR", help="Module zones, such as 8x8.", show_default=False)
 ]
 Detector = Annotated[
     str,
@@ -199,7 +200,9 @@ Judge = Annotated[
 SceneSettings = Annotated[
     list[str] | None,
     typer.Option(
-        "--set", metavar="KEY=VALUE", help="A key of the task: choose in other scenes than were learned; repeatable."
+        "--set",
+        metavar="KEY=VALUE",
+        help="A key of the task: choose in scenes other than the learned ones; repeatable.",
     ),
 ]
 Weights = Annotated[
@@ -224,22 +227,26 @@ Workers = Annotated[
 Certify = Annotated[
     bool,
     typer.Option(
-        "--certify", help="Bound what any other choice could gain at every number of rays, not the middle one."
+        "--certify", help="Bound what any other choice could gain at every number of rays, not just the middle one."
     ),
 ]
 Survive = Annotated[
     int | None,
-    typer.Option("--survive", metavar="0|1", help="1: choose for the loss of any one sensor.", show_default="0"),
+    typer.Option("--survive", metavar="0|1", help="1: allow for the loss of any one sensor.", show_default="0"),
 ]
-Losses = Annotated[bool, typer.Option("--losses", help="Also score designs with each of their sensors lost.")]
+Losses = Annotated[bool, typer.Option("--losses", help="Also score designs with each sensor lost in turn.")]
 Goal = Annotated[
     float | None,
-    typer.Option("--goal", metavar="SCORE", help="Score to keep, by the least that it takes.", show_default=False),
+    typer.Option(
+        "--goal", metavar="SCORE", help="Score to keep with as little as possible (see --least).", show_default=False
+    ),
 ]
 LEAST = "bandwidth|rays|sensors|parts"
 Least = Annotated[
     str | None,
-    typer.Option("--least", metavar=LEAST, help="What --goal saves; else bandwidth.", autocompletion=words(LEAST)),
+    typer.Option(
+        "--least", metavar=LEAST, help="What --goal minimises; by default bandwidth.", autocompletion=words(LEAST)
+    ),
 ]
 Adaptive = Annotated[
     int | None,
@@ -339,7 +346,7 @@ def part_names(
         return (parts if parts in (None, "catalog") else names), sensor_count(sensors)
     if None in (modules, fov, zones) or (parts, sensors) != (None, None):
         allowed = "--modules N --fov WxH --zones CxR, without --sensors and --parts"
-        raise ConfigError("this is no whole description of modules", where="--modules", allowed=allowed)
+        raise ConfigError("the description of the modules is incomplete", where="--modules", allowed=allowed)
     return [f"module-{fov}-{zones}"], modules
 
 
@@ -360,7 +367,7 @@ class StrictCommand(TyperCommand):
                 raise ConfigError("is empty", where=_name(parameter), allowed="a value", hint=UNSET_HINT)
             if text == "-":
                 raise ConfigError(
-                    "'-' is no value", where=_name(parameter), hint="give the name of a file; /dev/stdout is one"
+                    "'-' is not a value", where=_name(parameter), hint="give the name of a file; /dev/stdout is one"
                 )
         left = super().parse_args(ctx, args)
         from lidardesign.run.yaml import plain_number

@@ -415,7 +415,7 @@ def claim_outputs(output: Output, *, csv: Path | None = None, report: Path | Non
     is_page = report is not None and (report.is_file() or not report.exists())
     if is_page and report.suffix.lower() not in ("", *PAGE_SUFFIXES):
         raise ConfigError(
-            f"{report.name} is not a name of an HTML page",
+            f"{report.name} is not the name of an HTML page",
             where="--report",
             allowed=", ".join(PAGE_SUFFIXES),
             hint=f"--report {quote(str(report.with_suffix('.html')))}; a browser prints it as PDF",

@@ -111,7 +111,7 @@ def _choose_visibility(scenes: Sequence[Scene], config: RunConfig) -> tuple[str,
         return "raycast", BackgroundNote(reason)
     share = occluded_share(scenes, proposals, optics.margin_m + 3 * optics.sigma_m)
     if share < OCCLUDED_SHARE_TO_CARE:
-        reason = f"visibility off: of {len(proposals.points)} probed rays {share:.2%} had anything in the way"
+        reason = f"visibility off: {share:.2%} of {len(proposals.points)} probed rays had anything in the way"
         return "off", BackgroundNote(reason)
     reason = f"visibility by ray casting: {share:.1%} of {len(proposals.points)} probed rays were occluded"
     return "raycast", BackgroundNote(reason)

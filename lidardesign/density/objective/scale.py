@@ -249,7 +249,7 @@ def _thin_notes(sample: _Sample, config: RunConfig, least_m: float) -> list[str]
         enough = enough.widened(enough.sigma_m / 2)
         better = _returning_share(sample, enough)
     return [
-        f"of the rays that the density prefers {share:.1%} return: the targets are thinner than sigma, "
+        f"{share:.1%} of the rays that the density prefers return: the targets are thinner than sigma, "
         f"{optics.sigma_m:g} m; with density.sigma_m={enough.sigma_m:.2g} {better:.0%} would return"
     ]
 

@@ -301,7 +301,7 @@ class LearnedDensity:
             drawn = draw_samples(self._flow, math.ceil(KEPT_AT_ONCE * math.exp(-self._thinning.log_kept)))
             points = self._thinning.thinned(drawn, self._flow.generator).points
             if not len(points):
-                reason = "the task's training scenes are others than those that it was learned from"
+                reason = "the task's training scenes differ from those that it was learned from"
                 raise DataError(reason, where=str(self._run), hint="learn the run again")
             kept = np.concatenate([kept, points])
         return kept[:count]

@@ -187,7 +187,7 @@ def _effects(bench: Bench, note: str, own: Detector) -> list[Sweep]:
     return [
         Sweep(
             knob="effects",
-            error_of=f"change of the mean {metric.name} where an effect is left out of all or alone, whichever is more",
+            error_of=f"change of the mean {metric.name} with an effect left out or alone, whichever is more",
             unit=metric.unit,
             against="all effects that the scenes have",
             tolerance=metric.tolerance / len(there),

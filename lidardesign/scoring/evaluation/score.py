@@ -262,7 +262,7 @@ def _notes(request: EvaluationRequest, entries: Sequence[Entry], matched: Sequen
     positions = max(len(entry.positions) for entry in entries if not isinstance(entry.positions, AdaptiveRays))
     notes = left_out(request.designs, request.rays, request.alone)
     if positions > 1:
-        counted = f"rays and bandwidth count per position; every scene is seen from {positions} positions"
+        counted = f"rays and bandwidth are per position; every scene is seen from {positions} positions"
         notes.append(BackgroundNote(counted))
     notes += group_notes(request.test)
     if GREEDY in request.baselines and request.training is not None:

@@ -129,7 +129,7 @@ def check_better(evaluation: Evaluation, name: str) -> None:
         "; ".join(said),
         where="--fail-unless-better",
         allowed=f"better than {name} at every number of rays",
-        hint="score more held-out scenes, in which smaller differences are found" if is_open else None,
+        hint="score more held-out scenes to resolve smaller differences" if is_open else None,
     )
 
 

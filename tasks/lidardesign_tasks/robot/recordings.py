@@ -118,7 +118,7 @@ def _checked(model: mujoco.MjModel, path: Path) -> Recording:
             f"joints are missing: {listed(missing)}",
             where=str(path),
             allowed=f"a column each of {listed(names)}",
-            hint="of a joint that rests, the value at which it rests in every row",
+            hint="for a joint that rests, repeat its value in every row",
         )
     shapes = {np.shape(column) for column in (time_s, *table.values())}
     if len(shapes) > 1 or np.ndim(time_s) != 1 or len(time_s) < 2:

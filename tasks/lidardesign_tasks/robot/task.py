@@ -65,7 +65,7 @@ class MujocoConfig(FolderConfig, MovingSurroundings):
 
     model: Path | None = Field(None, description="MJCF or URDF file of the robot and what stands around it")
     folder: Path | None = Field(None, description="folder that holds all files of the model; its own if empty")
-    targets: Patterns = Field((), description="what to find: names of bodies or geoms, as [hand*]")
+    targets: Patterns = Field((), description="what to find: names of bodies or geoms, such as [hand*]")
     motion: Literal["random", "keyframes"] | Path = Field(
         "random", description="CSV or NPZ of joint positions over time (time_s and a column per joint; NAME.x, .y, .z, "
         ".qw, .qx, .qy, .qz of free ones), a folder of them, keyframes of the model, or random"
@@ -81,7 +81,7 @@ class MujocoConfig(FolderConfig, MovingSurroundings):
         description="place of the sensor in the mount's frame [m]; if empty: in front, 2 extents away, or on the mount",
     )
     origin_box_m: Metres | Vector = Field(0.0, description="half size of the box of sensor origins [m]; 0: fixed")
-    range_m: Interval | None = Field(None, description="shortest and longest range [m]; of targets if empty")
+    range_m: Interval | None = Field(None, description="shortest and longest range [m]; from the targets if empty")
     metric: Measure = Field(
         "position",
         description="what is scored: position of targets [m], their surface [mm], or whether they are seen [%]",
