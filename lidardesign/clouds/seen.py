@@ -10,6 +10,7 @@ import numpy as np
 
 from lidardesign.config import with_task_settings
 from lidardesign.errors import DataError
+from lidardesign.numerics import COARSE_SLACK, SLACK
 from lidardesign.report.scene_figure import own_triangles, scene_bounds
 from lidardesign.run.clock import phase
 from lidardesign.run_folder import RunFolder
@@ -33,8 +34,6 @@ COLUMNS = (
     ("occluder", "u1"), ("ray", "<u4"),
 )  # fmt: skip
 NANOSECONDS = 1e9
-ROUND_SHARE = 0.02  # of a round body's extent: as far are its triangles from it
-ROUNDING = 1e-6  # of a distance
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,12 +93,14 @@ class SeenScene:
             if not body.is_target:
                 continue
             corners, triangles = own_triangles(body, body.pose(), bounds_m)
-            seen = np.zeros(len(triangles), dtype=bool)
+            first, *others = np.moveaxis(corners[triangles], 1, 0)
+            # what has no area cannot be seen, and is not missed
+            size_m2 = np.square(np.ptp(corners, axis=0)).sum()
+            seen = np.linalg.norm(np.cross(others[0] - first, others[1] - first), axis=1) <= SLACK * size_m2
             for caster, pose in ((one, body.pose(frame)) for frame, one in enumerate(casters)):
-                middle = (corners @ pose[:3, :3].T + pose[:3, 3])[triangles].mean(axis=1)
-                extent = 0.0 if isinstance(body.shape, Mesh) else float(np.ptp(corners, axis=0).max())
+                placed = (corners @ pose[:3, :3].T + pose[:3, 3])[triangles]
                 for sensor in self.design.sensors:
-                    seen |= _seen_by(sensor, caster, number, middle, ROUND_SHARE * extent)
+                    seen |= _seen_by(sensor, caster, number, placed, is_mesh=isinstance(body.shape, Mesh))
             pose, own = body.pose(), triangles[~seen]
             faces.append(own + sum(map(len, vertices)))
             vertices.append(corners @ pose[:3, :3].T + pose[:3, 3])
@@ -109,18 +110,24 @@ class SeenScene:
         return np.concatenate(vertices)[used], compact.reshape(-1, 3).astype(np.int32)
 
 
-def _seen_by(sensor: Sensor, caster: SceneCaster, body: int, middle_m: np.ndarray, slack_m: float) -> np.ndarray:
-    """Mask of points of a body, (N, 3) [m], that a sensor sees."""
-    away = middle_m - sensor.origin_m
+def _seen_by(sensor: Sensor, caster: SceneCaster, body: int, triangles_m: np.ndarray, *, is_mesh: bool) -> np.ndarray:
+    """Mask of triangles of a body, (N, 3, 3) [m], that a sensor sees."""
+    middle = triangles_m.mean(axis=1)
+    away = middle - sensor.origin_m
     distance_m = np.linalg.norm(away, axis=1)
     seen = (sensor.gate_m[0] <= distance_m) & (distance_m < sensor.gate_m[1]) & (distance_m > 0)
+    if not is_mesh:
+        # the triangles of other bodies lie inside them; but these are convex, and show what faces the sensor
+        normal = np.cross(triangles_m[:, 1] - triangles_m[:, 0], triangles_m[:, 2] - triangles_m[:, 0])
+        outward = np.sign(np.einsum("ij,ij->i", normal, middle - triangles_m.mean(axis=(0, 1))))
+        seen &= outward * np.einsum("ij,ij->i", normal, away) < 0
     looking = away[seen] / distance_m[seen, None]
-    inside = (np.abs(sensor.tangent_of(looking)) <= np.array(sensor.field_of_view_rad) / 2 + ROUNDING).all(axis=1)
+    inside = (np.abs(sensor.tangent_of(looking)) <= np.array(sensor.field_of_view_rad) / 2 + COARSE_SLACK).all(axis=1)
     seen[seen] = inside
     looking = looking[inside]
     hits = caster.first_hit(np.broadcast_to(sensor.origin_m, looking.shape), looking)
-    near = distance_m[seen] - slack_m - ROUNDING * distance_m[seen]
-    seen[seen] = (hits.body == body) & (hits.range_m >= near)
+    near = hits.range_m >= (1 - COARSE_SLACK) * distance_m[seen] if is_mesh else True
+    seen[seen] = (hits.body == body) & near
     return seen
 
 

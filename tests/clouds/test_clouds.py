@@ -43,7 +43,7 @@ def seen():
 
 @pytest.mark.parametrize("detector", ["ideal", "single-photon"])
 def test_a_cloud_is_what_evaluate_scores_to_the_last_bit(flat, monkeypatch, detector):
-    run = open_run(flat.folder if hasattr(flat, "folder") else Path("run"))
+    run = open_run(flat)
     design, scored = run.fit(sensors=2, rays=16, name="two"), []
     score = type(run.task).score
 
@@ -168,7 +168,7 @@ def test_a_mesh_and_a_robot_of_ones_own_are_scenes(tmp_path):
         assert bodies[-1].poses[2, 3] == pytest.approx(height)
     with pytest.raises(DataError, match="no body 'foot'"):
         scene_of_file(tmp_path / "robot.xml", "foot")
-    found = Design(looking((0, 0, 0), aim=(0, 0, 1.0))).simulate(tmp_path / "robot.xml", rays=16)
+    found = Design(looking((0, 0, 0), aim=(0, 0, 1.0))).simulate(tmp_path / "robot.xml", rays=400)
     assert any(one.returned.any() for one in found[0].returns)
 
 
