@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lidardesign.errors import NumericalError
+from lidardesign.numerics import SLACK
 
 # Kinds of errors in `Estimate.kind`.
 STANDARD_ERROR = "standard error"
@@ -225,7 +226,10 @@ def paired_difference(
     first, second = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
     if first.shape != second.shape:
         raise NumericalError(f"{first.shape} and {second.shape} values do not pair", where="statistics")
-    return mean_interval(first - second, groups, limits=spanned(limits), level=level)
+    apart = first - second
+    # what rounding leaves of no difference is none
+    apart[np.abs(apart) <= SLACK * np.maximum(np.abs(first), np.abs(second))] = 0.0
+    return mean_interval(apart, groups, limits=spanned(limits), level=level)
 
 
 def worst_tenth(values: np.ndarray, better: str) -> float:

@@ -330,7 +330,8 @@ class Design(DesignSource):
     def __repr__(self) -> str:
         spec = self.specification
         rays = "rays left open" if spec.count is None else f"{spec.count} rays"
-        return f"<Design {self.name}: {len(spec.sensors)} sensors, layout {spec.layout}, {rays}>"
+        sensors = "1 sensor" if len(spec.sensors) == 1 else f"{len(spec.sensors)} sensors"
+        return f"<Design {self.name}: {sensors}, layout {spec.layout}, {rays}>"
 
     def _repr_html_(self) -> str:
         spec = self.specification

@@ -14,7 +14,7 @@ from lidardesign.constraints.document import Constraints
 from lidardesign.errors import ConfigError, DataError, LidardesignError, names_arguments
 from lidardesign.fitting.options import FitOptions
 from lidardesign.fitting.request import FitRequest
-from lidardesign.formats.designs import folder_of, reach_of, read_design
+from lidardesign.formats.designs import folder_of, reach_of, read_design, relative_folder
 from lidardesign.run.clock import Progress
 from lidardesign.run.files import writer
 from lidardesign.run.manifest import DAMAGED_HINT, read_manifest
@@ -237,7 +237,7 @@ class Run(RunFolder):
     def save_baseline(
         self, baseline: str, *, rays: int | None = None, name: str | None = None, seed: int | None = None
     ) -> Design:
-        """The design that fires exactly the rays of a baseline, each with the baseline's gate, saved in the run.
+        """The design that fires the rays of a baseline, as `evaluate` has it at this number of rays alone; it is saved.
 
         Arguments:
             baseline: Its name, as "greedy" or "bounding".
@@ -246,7 +246,8 @@ class Run(RunFolder):
             seed: Seed of all random numbers; the run's by default.
 
         Raises:
-            ConfigError: No such baseline, or one without rays of its own that stay the same in every scene.
+            ConfigError: No such baseline, or one without rays of its own that stay the same in every scene; a design of
+                this name is there.
         """
         from lidardesign.api.scores import evaluation_request
         from lidardesign.formats.rig import Rig, RigSensor, rig_design
@@ -254,6 +255,9 @@ class Run(RunFolder):
         from lidardesign.scoring.evaluation.entries import entries_of
 
         check_baseline(baseline)
+        path = self.design_path(name or f"{baseline}-rays")
+        if path.exists():
+            raise ConfigError(f"{path} is there already", where="name", allowed="another name")
         numbers = sorted(self.task.defaults.rays)
         count = numbers[len(numbers) // 2] if rays is None else rays
         allowed = "uniform, bounding, silhouette, lloyd, greedy"
@@ -266,8 +270,9 @@ class Run(RunFolder):
         fired = found[0].positions[0].as_angles()
         sensor = RigSensor("s0", fired.origin_m, fired.azimuth_rad, fired.elevation_rad, fired.gate_m)
         design = rig_design(Rig(f"baseline {baseline}", [sensor], [], ""), Path(baseline), None)
-        mount = mount_of(self.task, self.config.task)
-        made = Design(replace(design, name=name or f"{baseline}-rays", mount=mount), self)
+        mount, origin = mount_of(self.task, self.config.task), relative_folder(self.folder, path)
+        origin = {**design.provenance, "task": self.task.name, "run": origin}
+        made = Design(replace(design, name=path.stem, mount=mount, provenance=origin), self)
         made.save()
         return made
 

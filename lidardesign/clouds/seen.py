@@ -36,7 +36,7 @@ COLUMNS = (
 NANOSECONDS = 1e9
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class SeenScene:
     """What a design returns in a scene.
 
@@ -51,6 +51,10 @@ class SeenScene:
     scene: Scene
     returns: Sequence[Returns]
     effects: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        count = sum(int(one.returned.sum()) for one in self.returns)
+        return f"<SeenScene {self.scene.name}: {len(self.returns)} frames, {count} returns>"
 
     def points_m(self, number: int) -> np.ndarray:
         """The measured points of an entry of `returns`, not a number without a return, (N, 3) [m]."""

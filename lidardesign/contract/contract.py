@@ -171,4 +171,4 @@ def refuse_broken(name: str, findings: Sequence[Finding]) -> None:
     broken = [finding for finding in findings if finding.outcome == "fail"]
     if broken:
         listed = "; ".join(f"{finding.law}: {finding.detail}" for finding in broken)
-        raise BrokenLawError(f"{len(broken)} of {len(findings)} laws are broken: {listed}", where=f"task {name}")
+        raise BrokenLawError(f"broken laws: {len(broken)} of {len(findings)}: {listed}", where=f"task {name}")

@@ -78,6 +78,10 @@ def test_a_baseline_that_is_saved_scores_as_the_baseline_does(run, name):
     (own, row) = (row for row in run.evaluate([design], rays=[16]).rows if row.design in (name, f"{name}-rays"))
     np.testing.assert_allclose(own.per_scene, row.per_scene, rtol=1e-12)
     assert own.gates == row.gates
+    again = lidardesign.load_design(design.path)
+    assert again.simulate(rays=16)[0].returns[0].rays.direction.shape == (16, 3)
+    with pytest.raises(ConfigError, match="is there already"):
+        run.save_baseline(name, rays=16)
 
 
 @pytest.mark.parametrize(("name", "said"), [("random", "no fixed list"), ("cma", "no fixed list"), ("x", "unknown")])

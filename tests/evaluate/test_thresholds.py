@@ -10,6 +10,7 @@ from support.evaluations import METRIC, make_row
 from support.scoring import HitTask, design, make_request
 
 from lidardesign.errors import ThresholdError
+from lidardesign.estimates import paired_difference
 from lidardesign.scoring.evaluation.entries import StrongestBaseline
 from lidardesign.scoring.evaluation.results import Evaluation, Paired, verdict
 from lidardesign.scoring.evaluation.score import evaluate
@@ -43,6 +44,13 @@ def test_a_difference_is_told_in_one_sentence(better, difference, told):
     assert difference_text(Paired("f3", "greedy", 361, *difference), better, "mm") == told
 
 
+def test_designs_with_the_same_scores_are_the_same_and_rounding_is_no_difference():
+    scores = np.array([3.0, 5.0, 7.0, 9.0])
+    apart = paired_difference(scores, scores * (1 + 1e-14))
+    assert apart == (0.0, 0.0, 0.0)
+    assert difference_text(Paired("f", "g", 9, *apart), "lower", "mm") == "f is the same as g in every scene at 9 rays"
+
+
 def headlines(better, values, gates=9, strongest="greedy"):
     """Headlines of designs with such scores; differences to baselines are exact."""
     scores = {"uniform": 20.0, "bounding": 7.0, "greedy": 5.0}
@@ -61,12 +69,12 @@ def test_the_best_design_comes_first_beside_what_one_would_place_by_hand():
     assert headlines("lower", {"f": 6.0}) == [
         "f is better than uniform by 14.00 mm (13.50 to 14.50) and better than bounding by 1.00 mm (0.50 to 1.50) "
         "at 36 rays",
-        "The strongest baseline on training scenes is greedy (any rays, 9 gates): f is worse than greedy by 1.00 mm "
-        "(0.50 to 1.50)",
+        "The strongest baseline on training scenes is greedy (any rays, with 9 gates for the 1 of f): f is worse than "
+        "greedy by 1.00 mm (0.50 to 1.50)",
     ]
     several = headlines("lower", {"f": 6.0, "g": 5.2, "h": 4.0}, gates=1)
     assert several[0].startswith("h, the best design, is better than uniform by 16.00 mm")
-    assert "greedy (no more gates): h is better" in several[1]
+    assert "greedy (with no more gates): h is better" in several[1]
     assert several[2:] == ["Against greedy: h is better; f is worse; g: no significant difference"]
     assert headlines("higher", {"f": 6.0, "g": 8.0})[0].startswith("g, the best design, is worse than uniform")
 

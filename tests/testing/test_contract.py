@@ -233,7 +233,7 @@ def test_laws_that_need_a_broken_one_are_not_tried_and_say_so():
 
 
 def test_check_task_returns_findings_or_raises_with_every_broken_law():
-    with pytest.raises(BrokenLawError, match=r"2 of \d+ laws are broken: metric is defined") as caught:
+    with pytest.raises(BrokenLawError, match=r"broken laws: 2 of \d+: metric is defined") as caught:
         check_task(task_of(GOOD.replace(METRIC, METRIC.replace("radius error", " ")).replace("split, i)", "i)")))
     assert caught.value.exit_code == 6
     with pytest.raises(PluginError, match="version 9"):

@@ -31,7 +31,7 @@ def simulate(
             autocompletion=options.words(FORMATS),
         ),
     ] = "ply",
-    scenes: Annotated[int, typer.Option("--scenes", metavar="N", help="So many held-out scenes.")] = 1,
+    scenes: Annotated[int, typer.Option("--scenes", metavar="N", help="Number of held-out scenes.")] = 1,
     scene: Annotated[
         Path | None,
         typer.Option("--scene", metavar="FILE", help="A mesh or MuJoCo model of your own instead.", show_default=False),

@@ -162,7 +162,8 @@ def _show_laws(document: Mapping[str, Any], rich: RichConsole) -> None:
         table.add_row(law["law"], Text(*OUTCOMES[law["outcome"]]), law["detail"])
     rich.print(table)
     rich.print(
-        f"{document['pass']} laws hold, {document['fail']} do not, {document['skip']} do not apply or were not reached"
+        f"laws that hold: {document['pass']}, broken: {document['fail']}, "
+        f"not applicable or not reached: {document['skip']}"
     )
 
 

@@ -24,6 +24,8 @@ def comparison(pair: Paired, better: str, unit: str) -> str:
     word = "better" if (sign < 0) == (better == "lower") else "worse"
     ends = (None, None) if pair.ci_low is None or pair.ci_high is None else (sign * pair.ci_low, sign * pair.ci_high)
     low, high = ends if None in ends else sorted(ends)
+    if pair.difference == low == high == 0:
+        return f"the same as {pair.b} in every scene"
     unit = "percentage points" if unit == "%" else unit
     size, low_text, high_text = figure_and_interval(abs(pair.difference), low, high)
     by = f"{size} {unit}".rstrip()
@@ -55,7 +57,9 @@ def headline_texts(evaluation: Evaluation) -> list[str]:
     said = [f"{name} is {' and '.join(plain)} at {best.rays} rays"] if plain else []
     if strongest.name not in BY_HAND and strongest.name in pairs:
         its = next(row for row in evaluation.rows if (row.design, row.rays) == (strongest.name, best.rays))
-        may = f"any rays, {its.gates} gates" if its.gates > best.gates else "no more gates"
+        may = "with no more gates"
+        if its.gates > best.gates:
+            may = f"any rays, with {its.gates} gates for the {best.gates} of {best.design}"
         against = comparison(pairs[strongest.name], metric.better, metric.unit)
         said.append(
             f"The strongest baseline on training scenes is {strongest.name} ({may}): {best.design} is {against}"
