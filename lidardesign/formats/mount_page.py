@@ -136,6 +136,11 @@ def write_mounts(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     regions = [one.sensor.region_m for one in mounted if one.sensor.region_m > 0]
     if regions:
         notes.append(f"rays of {len(regions)} sensors start anywhere in a region: the page gives its middle")
+    beside = [one.name for one in mounted if one.part is not None and any(one.part.centre_rad)]
+    if beside:
+        notes.append(
+            f"fields of view of {', '.join(beside)} are not about their axes: here are axes, `show` has the middles"
+        )
     missing = [one.name for one in mounted if one.part is None and one.sensor.part is not None]
     if missing:
         notes.append(
@@ -365,7 +370,7 @@ def _before_drilling(mounted: Sequence[MountedPart]) -> list[str]:
     ]
     missing = [text for text, name in open_ if any(one.stated(name) == UNKNOWN for one in mounted)]
     found = []
-    if missing:
+    if missing and any(one.sensor.part is not None for one in mounted):
         found.append(f"<p><b>Before you drill</b>, find out for each part marked unknown: {'; '.join(missing)}.</p>")
     if any("unverified" in one.stated("zone_0") for one in mounted):
         found.append("<p>Confirm the first zone with a hand in one corner of the field.</p>")

@@ -101,7 +101,8 @@ def export(
             keep_times(source.folder, "export", output)
 
         def show(rich: RichConsole) -> None:
-            content = f"{exported.rays} rays" if exported.rays else f"{exported.sensors} sensors"
+            count, noun = (exported.rays, "ray") if exported.rays else (exported.sensors, "sensor")
+            content = f"{count} {noun}{'s' * (count != 1)}"
             rich.print(f"wrote {target} ({content})", soft_wrap=True)
 
         document = {"design": str(design), **exported.as_dict()}

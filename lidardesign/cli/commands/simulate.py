@@ -73,6 +73,8 @@ def simulate(
             notes = write_clouds(seen, out, format_)
         for note in notes:
             output.remark(note)
+        if not any(one.returned.any() for each in seen for one in each.returns):
+            output.remark("no ray returns: check that the scene stands where sensors look, in metres (--scale)")
         counts = [sum(int(one.returned.sum()) for one in each.returns) for each in seen]
         document = {
             "design": str(designs[0].path),

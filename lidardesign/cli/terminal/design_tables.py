@@ -22,6 +22,7 @@ ERROR_DIGITS = 2
 # Relative errors below what `number` shows of a figure are left out.
 SMALLEST_ERROR = 1e-4
 SPACE_MARK = ".space."
+LEAST_GAP = 0.0005  # of a certificate, that shows as a tenth of a percent
 
 
 def with_error(estimate: dict[str, Any]) -> str:
@@ -221,7 +222,8 @@ def _show_choice(design: DesignSpec, rich: RichConsole) -> None:
         what, count = ("poses of parts", len(design.sensors)) if are_parts else ("rays", last["rays"])
         text = f"chosen among {last['candidates']} {what} on {last['scenes']} training scenes"
         if last["gap"] <= MOST_GAP:
-            text += f"; no other choice of {count} could be more than {100 * last['gap']:.1f} % better there"
+            least = f"could be more than {100 * last['gap']:.1f} % better" if last["gap"] >= LEAST_GAP else "is better"
+            text += f"; no other choice of {count} {least} there"
         rich.print(text, soft_wrap=True)
 
 
