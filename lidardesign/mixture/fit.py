@@ -43,6 +43,8 @@ EM_SAMPLES = 20_000
 RESTARTS = 12
 # A field of view this near to the widest that it may have would be wider.
 WIDEST = 0.999
+ATTEMPTS = 3  # starts of a fit of which a sensor gets too little of the density
+TOO_FEW = ("--sensors",)  # what then conflicts
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -133,6 +135,18 @@ def fit_sensors(problem: FitProblem) -> FittedSensors:
         InfeasibleError: Constraints that contradict each other or hold too little of the density, or a number of
             sensors of which one would rest on too few samples.
     """
+    for attempt in range(ATTEMPTS - 1):
+        try:
+            return _fit(replace(problem, seed=problem.seed + attempt))
+        except InfeasibleError as error:
+            # where one sensor got too little of the density, another start may divide it better
+            if error.conflicts != TOO_FEW:
+                raise
+    return _fit(replace(problem, seed=problem.seed + ATTEMPTS - 1))
+
+
+def _fit(problem: FitProblem) -> FittedSensors:
+    """Sensors from one start; see `fit_sensors`."""
     constraints, samples = problem.constraints, problem.samples
     if problem.sensors is not None and not 1 <= problem.sensors <= MOST_FITTED:
         raise ConfigError(f"{problem.sensors} sensors", where="--sensors", allowed=f"1 to {MOST_FITTED}")
@@ -292,7 +306,7 @@ def _check_effective(ensemble: Ensemble, supports: Sequence[Support]) -> None:
 def _too_few(sensor: int, count: int, found: float) -> InfeasibleError:
     return InfeasibleError(
         f"sensor {sensor} of {count} would rest on {found:.0f} effective samples",
-        conflicts=["--sensors"],
+        conflicts=TOO_FEW,
         allowed=f"at least {LEAST_SAMPLES:g}",
         hint="fewer sensors, or learn longer (--preset standard or fine)",
     )
