@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
-from shlex import quote
+from shlex import join
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -37,7 +37,7 @@ from lidardesign.rays.proposals import nearest_samples
 from lidardesign.rays.training import CHOICE, TrainingScenes
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
-from lidardesign.run.manifest import versions
+from lidardesign.run.manifest import read_manifest, versions
 from lidardesign.run.yaml import dump_yaml, parse_yaml
 from lidardesign.run_folder import Notes, RunFolder, ignore, log_note
 from lidardesign.samples import Samples, load_samples
@@ -125,16 +125,29 @@ def _wider_run(request: FitRequest, conflicts: Sequence[str]) -> str | None:
     run = request.run
     origins = [rules.origin for rules in request.constraints.rules]
     singles = [place for one in origins for place in (one.fixed_m, one.low_m, one.high_m) if place is not None]
-    ends = np.stack([run.config.space.low[:3], run.config.space.high[:3]])
-    places = np.stack([*ends, *singles, *(place for one in origins for place in one.mounts_m or ())])
-    wider = np.stack([places.min(axis=0), places.max(axis=0)])
-    grown = [axis for axis in range(3) if (wider != ends)[:, axis].any()]
-    if not grown:
+    places = [*singles, *(place for one in origins for place in one.mounts_m or ())]
+    if not places:
         return None
-    folder = str(run.folder)
-    settings = " ".join(f"--set '{names[axis]}=[{wider[0, axis]:g}, {wider[1, axis]:g}]'" for axis in grown)
-    command = f"lidardesign learn {run.task.name} --config {quote(f'{folder}/{FILE_NAME}')} {settings}"
-    return f"loosen the constraint, or learn a run with room for it: {command} --out {quote(f'{folder}-wide')}"
+    ends = np.stack([run.config.space.low[:3], run.config.space.high[:3]])
+    words = [str(word) for word in read_manifest(run.folder).get("command") or ()]
+    if "origin_m" in type(run.config.task).model_fields and "--out" in words:
+        # directions and ranges then follow from the places, as the task has it
+        low, high = np.min(places, axis=0), np.max(places, axis=0)
+        wider = {"origin_m": (low + high) / 2, "origin_box_m": (high - low) / 2}
+        given = [n for n, word in enumerate(words) if word == "--out" or word.partition("=")[0] in wider]
+        gone = {n + shift for n in given for shift in ((0, 1) if words[n] == "--out" else (-1, 0))}
+        words = [word for n, word in enumerate(words) if n not in gone]
+    else:
+        low, high = np.min([*ends, *places], axis=0), np.max([*ends, *places], axis=0)
+        grown = [axis for axis in range(3) if low[axis] < ends[0, axis] or high[axis] > ends[1, axis]]
+        wider = {names[axis]: np.array([low[axis], high[axis]]) for axis in grown}
+        words = ["lidardesign", "learn", run.task.name, "--config", f"{run.folder}/{FILE_NAME}"]
+    if not wider:
+        return None
+    for name, values in wider.items():
+        words += ["--set", f"{name}=[{', '.join(f'{value:g}' for value in values)}]"]
+    words += ["--out", f"{run.folder}-wide"]
+    return f"loosen the constraint, or learn a run with room for it: {join(words)}"
 
 
 def check_written(design: DesignSpec, request: FitRequest) -> tuple[ConstraintCheck, ...]:

@@ -196,7 +196,7 @@ def _place_notes(design: DesignSpec) -> list[str]:
     here: dict[tuple[float, ...], list[str]] = {}
     for sensor in design.sensors:
         here.setdefault(tuple(np.round(sensor.origin_m, 3).tolist()), []).append(sensor.name)
-    several = [" and ".join(names) for names in here.values() if len(names) > 1]
+    several = [", ".join(names) for names in here.values() if len(names) > 1]
     if not several:
         return []
     return [f"{'; '.join(several)} stand in the same place: mount them together, or list places in origin.mounts_m"]

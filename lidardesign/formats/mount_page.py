@@ -21,14 +21,17 @@ import numpy as np
 from lidardesign.formats.mounts import quaternion
 from lidardesign.formats.names import distinct, document, element, identifier, write_folder
 from lidardesign.formats.robots import WORLD, fixed_link
+from lidardesign.numerics import EPSILON
 from lidardesign.parts.catalogue import parts_of
 from lidardesign.parts.part import Part
 from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.sensor import Sensor, boresight_frame, boresight_of
+from lidardesign.simulate.calibration import reach_of
 
 MM_PER_M = 1000.0
 UNKNOWN = "unknown"
+ROUNDING = 8 * EPSILON  # of angles [rad]
 FREE_RAYS = "any rays: --format csv lists them"
 
 
@@ -54,8 +57,9 @@ class MountedPart:
 
     @cached_property
     def angles_rad(self) -> tuple[float, float, float]:
-        """Azimuth, elevation and roll of its axes, the roll from -pi to pi."""
-        return boresight_of(self.axes)
+        """Azimuth, elevation and roll of its axes, the roll from -pi to pi; what rounding leaves of 0 is 0."""
+        azimuth, elevation, roll = (angle if abs(angle) > ROUNDING else 0.0 for angle in boresight_of(self.axes))
+        return azimuth, elevation, roll
 
     @property
     def roll_pitch_yaw_rad(self) -> tuple[float, float, float]:
@@ -297,8 +301,8 @@ def _page(design: DesignSpec, mounted: Sequence[MountedPart], frame: str, parent
     views = "".join(_sketch(mounted, *view) for view in VIEWS)
     commands = html.escape("\n".join(_transforms(mounted, parent)))
     body = [
-        f"<p>{len(mounted)} {'sensor' if len(mounted) == 1 else 'sensors'}. Places and directions are in the frame of "
-        f"<b>{html.escape(frame)}</b>: x forward, y to the left, z up. Numbers are rounded; "
+        f"<p>{len(mounted)} {'sensor' if len(mounted) == 1 else 'sensors'}. Places and directions are in "
+        f"{_frame_text(frame)}. Numbers are rounded; "
         "<code>mounts.csv</code> has all digits. No design of this program has been built in hardware yet.</p>",
         "<h2>Where, and which way</h2>", _poses(mounted), f"<p>{ANGLES}</p>",
         '<div class="views">', views, "</div>",
@@ -313,6 +317,13 @@ def _page(design: DesignSpec, mounted: Sequence[MountedPart], frame: str, parent
         f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n<style>{STYLE}</style>\n</head>\n<body>\n'
         f"<h1>{html.escape(title)}</h1>\n{''.join(body)}\n</body>\n</html>\n"
     )
+
+
+def _frame_text(frame: str) -> str:
+    """The frame of a page, as markup."""
+    if frame == "world":
+        return "the <b>world's</b> frame: x forward, y to the left, z up"
+    return f"the frame of <b>{html.escape(frame)}</b>, as the robot's model has it"
 
 
 def _poses(mounted: Sequence[MountedPart]) -> str:
@@ -331,8 +342,10 @@ def _poses(mounted: Sequence[MountedPart]) -> str:
 
 def _parts_table(mounted: Sequence[MountedPart]) -> str:
     """What each sensor is, and what is known of how it is mounted, with the sums of power and price."""
-    headings = ("sensor", "part", "fires", "field of view [deg]", "range [m]", "which side is up", "first zone looks",
-                "rays start at", "power [W]", "price")  # fmt: skip
+    headings = (
+        "sensor", "part", "fires", "field of view [deg]", "gate [m]", "reach in the dark / sun [m]", "which side is up",
+        "first zone looks", "rays start at", "power [W]", "price",
+    )  # fmt: skip
     rows = []
     for one in mounted:
         ends = one.field_deg
@@ -340,7 +353,8 @@ def _parts_table(mounted: Sequence[MountedPart]) -> str:
         if all(low == -high for low, high in ends):
             field = " x ".join(f"{high - low:.4g}" for low, high in ends)
         gate = " to ".join(f"{end:.3f}" for end in one.sensor.gate_m)
-        stated = [one.stated(name) for name in ("up", "zone_0", "origin")]
+        reach = UNKNOWN if one.part is None else next(iter(reach_of(one.part).as_text().values()))
+        stated = [reach, *(one.stated(name) for name in ("up", "zone_0", "origin"))]
         figures = [f"{value:g}" if (value := one.figure(name)) != "" else UNKNOWN for name in ("power_w", "price")]
         rows.append([one.name, one.sensor.part or "none: programmable", one.pattern, field, gate, *stated, *figures])
     totals = []
@@ -352,12 +366,12 @@ def _parts_table(mounted: Sequence[MountedPart]) -> str:
             if known
             else UNKNOWN
         )
-    rows.append(["in all", *[""] * 7, *totals])
+    rows.append(["in all", *[""] * 8, *totals])
     return _table(
         headings,
         rows,
-        "Fields of view are about the optical axis: across x up, or right to left and lower to upper end.",
-        (0, 1, 2, 5, 6, 7),
+        "Fields of view are about the optical axis: width x height, or right to left and lower to upper end.",
+        (0, 1, 2, 6, 7, 8),
     )
 
 

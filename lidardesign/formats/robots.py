@@ -112,7 +112,7 @@ def write_mjcf(
             f"{late.min():.3g} to {late.max():.3g} m; it stands in the rangefinders' user data"
         )
     if place.tag == "body":
-        notes.append(f"rays pass through the geoms of {design.mount!r}, which the sensors are on")
+        notes.append(f"rays ignore the geoms of {design.mount!r}, the body that carries the sensors")
     when = f"at {rate_hz:g} Hz; in between they keep what they read" if rate_hz else "at every step"
     return [
         *notes,

@@ -194,7 +194,7 @@ def _module(name: str) -> Part:
         raise ConfigError(
             f"{name!r} does not describe a module",
             where="parts",
-            allowed="a field of view in degrees and a number of zones, each across x up: --fov 45x45 --zones 8x8",
+            allowed="a field of view in degrees and a number of zones, each width x height: --fov 45x45 --zones 8x8",
         )
     across, up = (float(text) / 2 for text in found.groups()[:2])
     columns, rows = map(int, found.groups()[2:])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import re
+import shlex
 
 import numpy as np
 import pytest
@@ -163,3 +164,17 @@ def test_along_an_aisle_patterns_lead_all_the_way_and_keep_the_bandwidth_between
             assert len(rays) == count
             assert (rays.origin_m[:, 0] == at).all()
             assert Bandwidth().mbps(rays) <= 0.2 + 1e-12
+
+
+def test_the_command_of_a_refused_place_learns_a_run_that_has_room_for_it(lidardesign, run):
+    space = open_run(run).config.space
+    place = [float(space.low[0]) - 0.05, *map(float, space.low[1:3])]
+    words = ("--set", f"origin.fixed_m={place}", "--layout", "even", "--sensors", 1, "--name", "far")
+    refused = lidardesign("constrain", run, *words)
+    assert refused.code == 4
+    command = shlex.split(refused.err.partition("room for it: ")[2].splitlines()[0])
+    assert command[:2] == ["lidardesign", "learn"]
+    assert lidardesign(*command[1:]).code == 0
+    wide = open_run(command[command.index("--out") + 1])
+    np.testing.assert_allclose(wide.config.space.low[:3], place)
+    assert "space.x_m" not in lidardesign("constrain", wide.folder, *words).err
