@@ -88,24 +88,23 @@ def bins(mbps: float, rays: int) -> float:
 
 
 def rows_of(title: str, found: Mapping[str, Any]) -> list[list[object]]:
-    """One row per number of rays and design or baseline, with the paper's bandwidth beside ours."""
+    """One row per design and for uniform rays, with figures at all numbers of rays and the paper's bandwidth."""
     one, rows = EXPERIMENTS[title], []
     by_name = {(row["design"], row["rays"]): row for row in found["rows"]}
     theirs: dict[str, Sequence[float]] = {f"s{count or 0}": mbps for count, mbps in one.paper_mbps.items()}
-    theirs |= {"uniform": one.uniform_mbps, "random": one.uniform_mbps}
-    for index, rays in enumerate(one.rays):
-        for name, mbps in theirs.items():
-            row = by_name[name, rays]
-            called = (
-                f"{name[1:]} sensors"
-                if re.fullmatch(r"s[1-9]\d*", name)
-                else name
-                if name != "s0"
-                else "along the aisle"
-            )
-            interval = f"{row['value']:.3g} ({row['ci_low']:.3g} to {row['ci_high']:.3g})"
-            ours, paper = row["bandwidth_mbps"], mbps[index]
-            rows.append([rays, called, interval, ours, bins(ours, rays), paper, bins(paper, rays)])
+    for name, mbps in {**theirs, "uniform": one.uniform_mbps}.items():
+        own = [by_name[name, rays] for rays in one.rays]
+        middle = own[len(own) // 2]
+        called = f"{name[1:]} sensors" if re.fullmatch(r"s[1-9]\d*", name) else name if name != "s0" else "design"
+        figures = [
+            [row["value"] for row in own],
+            [row["bandwidth_mbps"] for row in own],
+            [bins(row["bandwidth_mbps"], row["rays"]) for row in own],
+            list(mbps),
+            [bins(value, rays) for value, rays in zip(mbps, one.rays, strict=True)],
+        ]
+        score, *others = (", ".join(f"{value:.3g}" for value in values) for values in figures)
+        rows.append([called, score, f"{middle['ci_low']:.3g} to {middle['ci_high']:.3g}", *others])
     return rows
 
 
@@ -124,7 +123,9 @@ def main() -> None:
     for title in options.only or EXPERIMENTS:
         found = measured(title, options)
         unit = found["metric"]["unit"]
-        columns = ["rays", "design", f"score [{unit}]", "Mbit/s", "bins", "paper's Mbit/s", "its bins"]
+        counts = EXPERIMENTS[title].rays
+        score = f"score [{unit}] at {', '.join(map(str, counts))} rays"
+        columns = ["", score, f"interval at {counts[1]}", "Mbit/s", "bins", "paper's Mbit/s", "its bins"]
         tables[title] = (columns, rows_of(title, found))
     if options.page is not None:
         text = options.page.read_text(encoding="utf-8")

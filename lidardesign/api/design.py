@@ -302,6 +302,8 @@ class Design(DesignSource):
         measuring = Measuring(detector, effects, seed)
         if scene is None:
             run = need_run(self.run, self.name)
+            for note in run.input_notes():
+                notes(note)
             return seen_scenes(run, self.specification, count, scenes, measuring, settings_texts(settings))
         return [
             seen_in_file(
