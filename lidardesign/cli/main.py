@@ -71,8 +71,8 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "lidardesign evaluate runs/arm --baseline occupancy --workers 8",
     ),
     "simulate": (
-        "lidardesign simulate runs/face/designs/free.yaml --format mcap --out faces.mcap --scenes 20",
-        "lidardesign simulate runs/face/designs/free.yaml --scene cup.stl --scale 0.001 --out cup",
+        "lidardesign simulate runs/face --scenes 20 --format mcap --out faces.mcap",
+        "lidardesign simulate free.yaml --scene cup.stl --scale 0.001 --out cup",
     ),
     "export": (
         "lidardesign export --list",

@@ -1,6 +1,7 @@
 """What robots' tools make of an exported design: MuJoCo runs it, libsdformat, check_urdf and xacro parse it."""
 
 import importlib.util
+import re
 import shutil
 import subprocess
 from dataclasses import replace
@@ -177,6 +178,24 @@ def test_sensors_on_a_robot_measure_our_distances_wherever_it_is(tmp_path, robot
     # but for a ray that grazes an edge, which the six digits of MuJoCo's own files move
     assert np.isclose(found, expected, rtol=0, atol=1e-4).mean() > 0.99
     np.testing.assert_array_equal(model.sensor_user[-len(RAYS) :, 2], RAYS.sensor)
+
+
+def test_the_lines_of_the_docs_read_the_points_inside_gates(exported):
+    import mujoco
+
+    path, _ = exported["mjcf"]
+    main = path.with_name("read.xml")
+    main.write_text(mujoco_scene(path.name), encoding="utf-8")
+    model, data = simulated(main)
+    page = (Path(__file__).parents[2] / "docs" / "formats.md").read_text(encoding="utf-8")
+    (lines,) = re.findall(r"```python\n(mujoco.mj_step.*?)```", page, re.DOTALL)
+    names = {"mujoco": mujoco, "model": model, "data": data}
+    exec(lines, names)
+    ours = SceneCaster(scene()).first_hit(RAYS.origin_m, RAYS.direction)
+    inside = (ours.range_m >= RAYS.gate_m[:, 0]) & (ours.range_m < RAYS.gate_m[:, 1])
+    assert inside.any()
+    expected = (RAYS.origin_m + ours.range_m[:, None] * RAYS.direction)[inside]
+    np.testing.assert_allclose(names["points"], expected, rtol=0, atol=1e-4)
 
 
 @pytest.mark.parametrize("rate_hz", [0, 10, 20, 33])

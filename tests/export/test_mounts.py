@@ -118,7 +118,7 @@ def test_identifiers_are_words_and_no_two_alike(names):
 def test_a_plain_name_stays():
     assert identifier("front_left_2") == "front_left_2"
     assert renamed_note(["a", "b"], ["a", "b"]) == []
-    assert "'ä b' is a_b" in renamed_note(["ä b"], identifiers(["ä b"]))[0]
+    assert "'ä b' became a_b" in renamed_note(["ä b"], identifiers(["ä b"]))[0]
     assert "and 2 more" in renamed_note(["1"] * 5, identifiers(["1"] * 5))[0]
 
 

@@ -50,7 +50,7 @@ def simulate(
     quiet: options.Quiet = False,
     verbose: options.Verbose = False,
 ) -> None:
-    """Write what a design sees in held-out scenes, or in a mesh or robot of your own."""
+    """Write what a design sees, as clouds of points."""
     with command(json=json, quiet=quiet, verbose=verbose) as output:
         with phase("libraries"):
             from lidardesign.api.design import collect_designs
