@@ -1,4 +1,4 @@
-"""Experiments A to C of the paper (Behari et al. 2026): sensors, rays, scores and bandwidth, the paper's beside ours.
+"""Experiments A to D of the paper (Behari et al. 2026): sensors, rays, scores and bandwidth, the paper's beside ours.
 
 Five seeds are learned as drafts and evaluated together on held-out scenes of another seed. The paper gives bandwidth as
 numbers and scores as curves; it sends 40 bits a bin at 10 Hz, so that every bandwidth is a number of bins per ray. What
@@ -55,6 +55,26 @@ EXPERIMENTS = {
 }  # fmt: skip
 
 
+EMITTERS = "emitters"
+EMITTER_RAYS = 576
+# Where emitters may stand: at the detector, beside it, or three around it with none where the camera is.
+CAMERA = {"low_m": [0.3, -0.025, -0.02], "high_m": [0.5, 0.025, 0.02]}
+BOXES = (
+    ([0.39, 0.02, -0.03], [0.41, 0.08, 0.03]), ([0.39, -0.08, -0.03], [0.41, -0.02, 0.03]),
+    ([0.39, -0.03, 0.01], [0.41, 0.03, 0.07]),
+)  # fmt: skip
+PLACEMENTS: dict[str, dict[str, Any]] = {
+    "at the detector": {"sensors": {"count": 1}, "origin": {"fixed_m": [0.4, 0.0, 0.0]}},
+    "8 cm aside": {"sensors": {"count": 1}, "origin": {"fixed_m": [0.4, 0.08, 0.0]}},
+    "three around the camera": {
+        "sensors": {"count": 3},
+        "origin": {"exclude": [CAMERA]},
+        "each": [{"origin": {"low_m": low, "high_m": high}} for low, high in BOXES],
+    },
+}
+LIGHTS = {"geometry": (), "light transport": ("--detector", "single-photon", "--effects", "all")}
+
+
 def document(*words: str | Path) -> dict[str, Any]:
     """The document that a command prints."""
     return run_process(lidardesign(*words, "--json")).document()
@@ -80,6 +100,41 @@ def measured(title: str, options: Any) -> dict[str, Any]:
     found = document("evaluate", *runs, *words, *scenes)
     kept.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     return found
+
+
+def emitters(options: Any) -> dict[str, Any]:
+    """What `evaluate` prints of emitters at each placement, by geometry and by light transport; made where missing."""
+    place, kept = options.folder / EMITTERS, options.folder / f"{EMITTERS}.{options.seeds}.json"
+    if kept.exists():
+        return json.loads(kept.read_text(encoding="utf-8"))
+    runs = [place / str(seed) for seed in range(options.seeds)]
+    names = {title: title.replace(" ", "-") for title in PLACEMENTS}
+    for seed, run in enumerate(runs):
+        print(f"{EMITTERS}, seed {seed}", file=sys.stderr, flush=True)
+        if not (run / "samples.npz").exists():
+            document("learn", "emitter", "--preset", options.preset, "--seed", str(seed), "--out", run)
+        for title, rules in PLACEMENTS.items():
+            if not (run / "designs" / f"{names[title]}.yaml").exists():
+                file = options.folder / f"{names[title]}.yaml"
+                file.write_text(json.dumps(rules), encoding="utf-8")
+                words = ("--rays", str(EMITTER_RAYS), "--name", names[title])
+                document("constrain", run, "--constraints", file, *words)
+    words = ("--rays", str(EMITTER_RAYS), "--scenes-seed", HELD_OUT_SEED, "--set", "test=20", "--baseline", "none")
+    found = {light: document("evaluate", *runs, *words, *choice) for light, choice in LIGHTS.items()}
+    kept.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    return found
+
+
+def emitter_rows(found: Mapping[str, Any]) -> list[list[object]]:
+    """One row per placement with its scores by geometry and by light transport."""
+    rows = []
+    for title in PLACEMENTS:
+        by_light = [
+            next(row for row in one["rows"] if row["design"] == title.replace(" ", "-")) for one in found.values()
+        ]
+        cells = [f"{row['value']:.3g} ({row['ci_low']:.3g} to {row['ci_high']:.3g})" for row in by_light]
+        rows.append([title, *cells])
+    return rows
 
 
 def bins(mbps: float, rays: int) -> float:
@@ -115,12 +170,15 @@ def main() -> None:
     made.add_argument("--seeds", type=int, default=5, help="how many runs are learned (default %(default)s)")
     made.add_argument("--scenes", type=int, default=50, help="held-out scenes (default %(default)s)")
     made.add_argument("--preset", default="draft", help="of learning (default %(default)s)")
-    made.add_argument("--only", action="append", choices=list(EXPERIMENTS), help="only this one; repeatable")
+    made.add_argument("--only", action="append", choices=[*EXPERIMENTS, EMITTERS], help="only this one; repeatable")
     made.add_argument("--page", type=Path, help="a page whose tables between <!-- NAME --> marks are replaced")
     options = made.parse_args()
     options.folder.mkdir(parents=True, exist_ok=True)
     tables = {}
-    for title in options.only or EXPERIMENTS:
+    for title in options.only or [*EXPERIMENTS, EMITTERS]:
+        if title == EMITTERS:
+            tables[title] = (["emitters", *(f"{light} [mm]" for light in LIGHTS)], emitter_rows(emitters(options)))
+            continue
         found = measured(title, options)
         unit = found["metric"]["unit"]
         counts = EXPERIMENTS[title].rays
