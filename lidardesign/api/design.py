@@ -298,18 +298,24 @@ class Design(DesignSource):
         from lidardesign.clouds.seen import Measuring, scene_of_file, seen_in_file, seen_scenes
 
         check_number(scenes, "--scenes", 1, MOST_SCENES, whole=True)
-        count = self.usual_count(notes) if rays is None else rays
-        measuring = Measuring(detector, effects, seed)
+        count, spec = self.usual_count(notes) if rays is None else rays, self.specification
         if scene is None:
             run = need_run(self.run, self.name)
             for note in run.input_notes():
                 notes(note)
-            return seen_scenes(run, self.specification, count, scenes, measuring, settings_texts(settings))
-        return [
-            seen_in_file(
-                scene_of_file(Path(scene), self.specification.mount, scale), self.specification, count, measuring
-            )
-        ]
+            measuring = Measuring(detector, effects, seed)
+            found = seen_scenes(run, spec, count, scenes, measuring, settings_texts(settings))
+            if len(found) < scenes:
+                notes(f"there are {len(found)} held-out scenes; --set test=N makes more, where the task has that key")
+            return found
+        if settings or scenes != 1 or spec.condition is not None:
+            fault = "a design whose rays follow a condition" if spec.condition is not None else "--set or --scenes"
+            raise ConfigError(f"{fault} together with a scene of your own", where="--scene", allowed="held-out scenes")
+        if spec.following(count) is not None:
+            notes("in a scene of your own the best single pattern fires")
+        seed = self.run.config.seed if seed is None and self.run is not None else seed
+        own = scene_of_file(Path(scene), spec.mount, scale)
+        return [seen_in_file(own, spec, count, Measuring(detector, effects, seed))]
 
     def figure(self, count: int | None = None) -> Figure:
         """Its sensors in space, with fields of view and gates, and its rays where their number is given (plotly)."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from lidardesign.api.design import Design, html_table
 from lidardesign.api.learn import LearnOptions, LearnRequest, check_tolerance
 from lidardesign.constraints.document import Constraints
-from lidardesign.errors import ConfigError, DataError, LidardesignError, names_arguments
+from lidardesign.errors import ConfigError, DataError, LidardesignError, check_number, names_arguments
 from lidardesign.fitting.options import FitOptions
 from lidardesign.fitting.request import FitRequest
 from lidardesign.formats.designs import folder_of, reach_of, read_design, relative_folder
@@ -20,6 +20,7 @@ from lidardesign.run.files import writer
 from lidardesign.run.manifest import DAMAGED_HINT, read_manifest
 from lidardesign.run.outputs import CACHE
 from lidardesign.run_folder import MANIFEST, Notes, RunFolder, log_note
+from lidardesign.sensors.sensor import MOST_RAYS
 from lidardesign.task import mount_of
 
 if TYPE_CHECKING:
@@ -255,11 +256,13 @@ class Run(RunFolder):
         from lidardesign.scoring.evaluation.entries import entries_of
 
         check_baseline(baseline)
-        path = self.design_path(name or f"{baseline}-rays")
+        name = FitOptions(name=name or f"{baseline}-rays").name
+        path = self.design_path(str(name))
         if path.exists():
             raise ConfigError(f"{path} is there already", where="name", allowed="another name")
         numbers = sorted(self.task.defaults.rays)
         count = numbers[len(numbers) // 2] if rays is None else rays
+        check_number(count, "--rays", 1, MOST_RAYS, whole=True)
         allowed = "uniform, bounding, silhouette, lloyd, greedy"
         found = []
         if baseline in allowed.split(", "):

@@ -16,7 +16,7 @@ from lidardesign.formats.mounts import quaternion
 from lidardesign.formats.names import identifier, write_folder
 from lidardesign.formats.robots import WORLD
 from lidardesign.run.files import write_atomic
-from lidardesign.scenes.rays import Outcome
+from lidardesign.scenes.rays import DEFAULT_RATE_HZ, Outcome
 
 FORMATS = ("ply", "pcd", "mcap")
 PCD_KINDS = {"f": "F", "u": "U"}
@@ -39,7 +39,8 @@ def write_clouds(seen: Sequence[SeenScene], path: Path, form: str) -> list[str]:
         raise ConfigError(f"unknown format {form!r}", where="--format", allowed=", ".join(FORMATS))
     if form == "mcap":
         write_atomic(path, _mcap(seen))
-        return []
+        name = seen[0].design.condition
+        return [] if name is None else [f"/tf_static has the sensors at one {name}; clouds follow them"]
     files = {}
     for number, one in enumerate(seen):
         scene = f"{number:03d}_{identifier(one.scene.name)}"
@@ -91,5 +92,6 @@ def _mcap(seen: Sequence[SeenScene]) -> bytes:
     for one in seen:
         for number in range(len(one.returns)):
             clouds.append((time_ns, cloud_message(one.cloud(number), time_ns, parent)))
-            time_ns += round(NANOSECONDS / one.scene.frame_rate_hz)
+            # clouds do not overlap in time
+            time_ns += round(NANOSECONDS / min(one.scene.frame_rate_hz, DEFAULT_RATE_HZ))
     return mcap_content(clouds, transforms_message(parent, frames))

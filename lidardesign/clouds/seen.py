@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from lidardesign.config import with_task_settings
-from lidardesign.errors import DataError
+from lidardesign.errors import ConfigError, DataError
 from lidardesign.numerics import COARSE_SLACK, SLACK
 from lidardesign.report.scene_figure import own_triangles, scene_bounds
 from lidardesign.run.clock import phase
@@ -17,7 +17,7 @@ from lidardesign.run_folder import RunFolder
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.mesh_files import SUFFIXES, load_mesh
 from lidardesign.scenes.rays import Returns
-from lidardesign.scenes.scene import Body, Mesh, Scene, inverse_rigid
+from lidardesign.scenes.scene import Body, Round, Scene, inverse_rigid
 from lidardesign.scoring.evaluation.entries import entries_of
 from lidardesign.scoring.evaluation.request import EvaluationRequest
 from lidardesign.scoring.scene_scores import RaysPerCondition, returns_in_scene
@@ -34,6 +34,8 @@ COLUMNS = (
     ("occluder", "u1"), ("ray", "<u4"),
 )  # fmt: skip
 NANOSECONDS = 1e9
+Y_UP = (".glb", ".gltf")  # files that have y up, by their format
+LONGEST_SHARE, MOST_TRIANGLES = 1 / 16, 500_000  # of a body's extent, in which what is seen is told; of a body
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -84,27 +86,31 @@ class SeenScene:
         return table
 
     def unseen(self) -> tuple[np.ndarray, np.ndarray]:
-        """Triangles of the targets that no sensor sees in any frame, where they are in the first frame.
+        """Triangles of the targets that no sensor sees in any entry of `returns`, where they are in the first frame.
 
-        A triangle is seen where its middle lies in a sensor's field of view and gate with nothing in between.
+        Large triangles are divided. One is seen where its middle lies in the field of view and gate of a sensor that
+        fires, from where it fires, with nothing in between.
 
         Returns:
             Vertices (V, 3) [m] and faces (F, 3).
         """
-        casters, vertices, faces = build_casters(self.scene), [], []
+        views, vertices, faces = self._views(), [], []
         bounds_m = scene_bounds(self.scene, 0, [one.rays for one in self.returns])
         for number, body in enumerate(self.scene.bodies):
             if not body.is_target:
                 continue
-            corners, triangles = own_triangles(body, body.pose(), bounds_m)
+            corners, triangles = _divided(*own_triangles(body, body.pose(), bounds_m))
             first, *others = np.moveaxis(corners[triangles], 1, 0)
             # what has no area cannot be seen, and is not missed
             size_m2 = np.square(np.ptp(corners, axis=0)).sum()
             seen = np.linalg.norm(np.cross(others[0] - first, others[1] - first), axis=1) <= SLACK * size_m2
-            for caster, pose in ((one, body.pose(frame)) for frame, one in enumerate(casters)):
+            for frame, caster, sensors in views:
+                pose = body.pose(frame)
                 placed = (corners @ pose[:3, :3].T + pose[:3, 3])[triangles]
-                for sensor in self.design.sensors:
-                    seen |= _seen_by(sensor, caster, number, placed, is_mesh=isinstance(body.shape, Mesh))
+                centre = placed.mean(axis=(0, 1)) if isinstance(body.shape, Round) else None
+                for sensor in sensors:
+                    rest = np.flatnonzero(~seen)
+                    seen[rest] = _seen_by(sensor, caster, number, placed[rest], centre)
             pose, own = body.pose(), triangles[~seen]
             faces.append(own + sum(map(len, vertices)))
             vertices.append(corners @ pose[:3, :3].T + pose[:3, 3])
@@ -113,24 +119,52 @@ class SeenScene:
         used, compact = np.unique(np.concatenate(faces), return_inverse=True)
         return np.concatenate(vertices)[used], compact.reshape(-1, 3).astype(np.int32)
 
+    def _views(self) -> list[tuple[int, SceneCaster, list[Sensor]]]:
+        """The frame of each entry of `returns`, with the sensors that fire in it where they fire from."""
+        casters, found = build_casters(self.scene), []
+        for one in self.returns:
+            rays = one.rays
+            places = {index: rays.origin_m[rays.sensor == index].mean(axis=0) for index in np.unique(rays.sensor)}
+            sensors = [replace(self.design.sensors[index], origin_m=place) for index, place in places.items()]
+            found.append((one.frame, casters[one.frame], sensors))
+        return found
 
-def _seen_by(sensor: Sensor, caster: SceneCaster, body: int, triangles_m: np.ndarray, *, is_mesh: bool) -> np.ndarray:
-    """Mask of triangles of a body, (N, 3, 3) [m], that a sensor sees."""
+
+def _divided(corners: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Triangles of which none is long beside its body, each longer one divided into four again and again."""
+    longest_m = LONGEST_SHARE * float(np.linalg.norm(np.ptp(corners, axis=0)))
+    while True:
+        ends = corners[triangles]
+        is_long = np.linalg.norm(ends - ends[:, [1, 2, 0]], axis=2).max(axis=1) > longest_m
+        if not is_long.any() or len(triangles) + 3 * is_long.sum() > MOST_TRIANGLES:
+            return corners, triangles
+        split, count = triangles[is_long], len(corners)
+        middles = (corners[split] + corners[split[:, [1, 2, 0]]]) / 2
+        corners = np.concatenate([corners, middles.reshape(-1, 3)])
+        (a, b, c), (ab, bc, ca) = split.T, count + np.arange(3 * len(split)).reshape(-1, 3).T
+        parts = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
+        triangles = np.concatenate([triangles[~is_long], *(np.stack(part, axis=1) for part in parts)])
+
+
+def _seen_by(
+    sensor: Sensor, caster: SceneCaster, body: int, triangles_m: np.ndarray, centre_m: np.ndarray | None
+) -> np.ndarray:
+    """Mask of triangles of a body, (N, 3, 3) [m], that a sensor sees; a round body has a centre."""
     middle = triangles_m.mean(axis=1)
     away = middle - sensor.origin_m
     distance_m = np.linalg.norm(away, axis=1)
     seen = (sensor.gate_m[0] <= distance_m) & (distance_m < sensor.gate_m[1]) & (distance_m > 0)
-    if not is_mesh:
-        # the triangles of other bodies lie inside them; but these are convex, and show what faces the sensor
+    if centre_m is not None:
+        # the triangles of round bodies lie inside them; but these are convex, and show what faces the sensor
         normal = np.cross(triangles_m[:, 1] - triangles_m[:, 0], triangles_m[:, 2] - triangles_m[:, 0])
-        outward = np.sign(np.einsum("ij,ij->i", normal, middle - triangles_m.mean(axis=(0, 1))))
+        outward = np.sign(np.einsum("ij,ij->i", normal, middle - centre_m))
         seen &= outward * np.einsum("ij,ij->i", normal, away) < 0
     looking = away[seen] / distance_m[seen, None]
     inside = (np.abs(sensor.tangent_of(looking)) <= np.array(sensor.field_of_view_rad) / 2 + COARSE_SLACK).all(axis=1)
     seen[seen] = inside
     looking = looking[inside]
     hits = caster.first_hit(np.broadcast_to(sensor.origin_m, looking.shape), looking)
-    near = hits.range_m >= (1 - COARSE_SLACK) * distance_m[seen] if is_mesh else True
+    near = True if centre_m is not None else hits.range_m >= (1 - COARSE_SLACK) * distance_m[seen]
     seen[seen] = (hits.body == body) & near
     return seen
 
@@ -208,10 +242,16 @@ def scene_of_file(path: Path, mount: str | None, scale: float = 1.0) -> Scene:
         scale: Factor from a mesh's unit to metres.
 
     Raises:
+        ConfigError: A scale for a robot.
         DataError: The file cannot be read.
     """
-    if path.suffix.lower() in SUFFIXES:
-        return Scene((Body(load_mesh(path, scale=scale), path.stem),), path.stem)
+    if (suffix := path.suffix.lower()) in SUFFIXES:
+        mesh = load_mesh(path, scale=scale)
+        if suffix in Y_UP:
+            mesh = replace(mesh, vertices=mesh.vertices[:, [2, 0, 1]])
+        return Scene((Body(mesh, path.stem),), path.stem)
+    if scale != 1:
+        raise ConfigError("only meshes have a scale", where="--scale", hint="leave it out")
     from lidardesign.scenes.mujoco_models import body_poses, load_model, visible_geoms
 
     model, _ = load_model(path)

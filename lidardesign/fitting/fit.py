@@ -124,12 +124,14 @@ def _wider_run(request: FitRequest, conflicts: Sequence[str]) -> str | None:
         return None
     run = request.run
     origins = [rules.origin for rules in request.constraints.rules]
-    singles = [place for one in origins for place in (one.fixed_m, one.low_m, one.high_m) if place is not None]
-    places = [*singles, *(place for one in origins for place in one.mounts_m or ())]
+    ends = np.stack([run.config.space.low[:3], run.config.space.high[:3]])
+    boxes = [(one.low_m or ends[0], one.high_m or ends[1]) for one in origins if one.low_m or one.high_m]
+    places = [place for one in origins for place in (one.fixed_m, *(one.mounts_m or ())) if place is not None]
+    places += [place for low, high in boxes for place in (low, np.maximum(low, high))]
     if not places:
         return None
-    ends = np.stack([run.config.space.low[:3], run.config.space.high[:3]])
-    words = [str(word) for word in read_manifest(run.folder).get("command") or ()]
+    command = [str(word) for word in read_manifest(run.folder).get("command") or ()]
+    words = [part for word in command for part in (word.split("=", 1) if word.startswith("--") else [word])]
     if "origin_m" in type(run.config.task).model_fields and "--out" in words:
         # directions and ranges then follow from the places, as the task has it
         low, high = np.min(places, axis=0), np.max(places, axis=0)

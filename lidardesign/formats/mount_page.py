@@ -121,7 +121,9 @@ def _by_axis(name: str, vector: np.ndarray) -> dict[str, float]:
 
 def mounted_parts(design: DesignSpec) -> list[MountedPart]:
     """The sensors of a design as they are mounted, in their order."""
-    names = distinct([identifier(sensor.name) for sensor in design.sensors], "_")
+    # a sensor's link is not the one that it is mounted on
+    taken = [(design.mount or "").removesuffix("_link")]
+    names = distinct([identifier(sensor.name) for sensor in design.sensors], "_", taken=taken)
     return [MountedPart(*one) for one in zip(names, design.sensors, parts_of(design), strict=True)]
 
 
@@ -246,11 +248,14 @@ def _arrow(x: float, y: float, looks: np.ndarray, nearer: float) -> str:
 
 def _ordinates(values_mm: np.ndarray, place_of: Callable[[float], float], *, along: bool) -> list[str]:
     """The coordinates of places with leaders, along the lower edge or the left one; close ones are drawn apart."""
-    lines, last = [], -math.inf
-    distinct_mm = sorted(set(np.round(values_mm, 1).tolist()), key=place_of)
-    for value in distinct_mm:
-        at = place_of(value)
-        label = last = max(at, last + APART)
+    lines, distinct_mm = [], sorted(set(np.round(values_mm, 1).tolist()), key=place_of)
+    places = np.array([place_of(value) for value in distinct_mm])
+    # labels are apart, and keep to the edge as far as there is room
+    end = (WIDTH if along else HEIGHT) - EDGE
+    apart = min(APART, (end - EDGE / 2) / max(len(places) - 1, 1)) * np.arange(len(places))
+    labels = np.maximum.accumulate(places - apart)
+    labels = np.minimum(labels, end - apart[-1]) + apart
+    for value, at, label in zip(distinct_mm, places, labels, strict=True):
         text = f"{value + 0.0:.1f}"
         if along:
             bottom = HEIGHT - EDGE + 6

@@ -84,6 +84,12 @@ def test_a_baseline_that_is_saved_scores_as_the_baseline_does(run, name):
         run.save_baseline(name, rays=16)
 
 
+@pytest.mark.parametrize("choice", [{"name": "../x"}, {"name": "x/y"}, {"rays": 0}, {"rays": -3}])
+def test_a_baseline_keeps_to_names_and_numbers_that_designs_have(run, choice):
+    with pytest.raises(ConfigError):
+        run.save_baseline("uniform", **choice)
+
+
 @pytest.mark.parametrize(("name", "said"), [("random", "no fixed list"), ("cma", "no fixed list"), ("x", "unknown")])
 def test_a_baseline_without_rays_of_its_own_is_not_saved(run, name, said):
     with pytest.raises(ConfigError, match=said) as refused:

@@ -109,7 +109,7 @@ def test_rosbags_reads_clouds_and_frames(seen, tmp_path):
         for connection, time_ns, raw in reader.messages():
             messages.setdefault(connection.topic, []).append((time_ns, reader.deserialize(raw, connection.msgtype)))
     assert qos["/tf_static"].durability.name == "TRANSIENT_LOCAL"
-    assert [time_ns for time_ns, _ in messages["/points"]] == [0, 100_000_000]
+    assert [time_ns for time_ns, _ in messages["/points"]] == [0, 100_000_000]  # a frame of the design
     cloud = messages["/points"][1][1]
     assert (cloud.header.frame_id, cloud.header.stamp.nanosec, cloud.width) == ("world", 100_000_000, 200)
     assert [(field.name, field.offset) for field in cloud.fields] == [
@@ -133,7 +133,7 @@ def outward(found):
 
 
 def of(*places, scene=ROOM, **changes):
-    return SeenScene(looking(*places, **changes), scene, [])
+    return seen_in_file(scene, looking(*places, **changes), 60, Measuring())
 
 
 def test_what_no_sensor_sees_is_the_far_side(seen):
@@ -143,6 +143,43 @@ def test_what_no_sensor_sees_is_the_far_side(seen):
     assert len(outward(of(*around))) == 0
     assert len(outward(of((2.5, 0, 0)))) == len(outward(of((0, 0, 0), gate_m=(4.0, 5.0))))  # behind the wall
     assert len(outward(of((0, 0, 0), field_rad=0.1))) > len(outward(of((0, 0, 0))))
+
+
+def area_m2(found):
+    vertices, faces = found.unseen()
+    first, second, third = np.moveaxis(vertices[faces], 1, 0)
+    return np.linalg.norm(np.cross(second - first, third - first), axis=1).sum() / 2
+
+
+def test_of_a_large_face_the_part_in_the_field_is_seen():
+    wall = Scene((replace(WALL, role="target"),), "wall")
+    whole = 2 * (4 * 4 + 2 * 0.1 * 4)  # six faces of 4 x 4 x 0.1 m
+    field_m2 = 4 * np.tan(0.3) ** 2 * 1.95**2
+    assert area_m2(of((0, 0, 0), scene=wall, field_rad=0.6, gate_m=(1.0, 3.0))) == pytest.approx(
+        whole - field_m2, rel=0.02
+    )
+
+
+def test_a_sensor_is_where_its_rays_start():
+    seen = of((0, 0, 0))
+    moved = replace(seen.returns[0].rays, origin_m=seen.returns[0].rays.origin_m - (0, 0, 5.0))
+    there = SeenScene(seen.design, seen.scene, [replace(seen.returns[0], rays=moved)])
+    assert len(outward(there)) > len(outward(seen))  # from there the ball is not in the field
+    assert len(outward(SeenScene(seen.design, seen.scene, [*seen.returns, *there.returns]))) == len(outward(seen))
+
+
+def test_files_with_y_up_stand_upright(tmp_path):
+    import trimesh
+
+    trimesh.creation.box((0.1, 1.0, 0.2)).export(tmp_path / "tall.glb")
+    (tall,) = scene_of_file(tmp_path / "tall.glb", None).bodies
+    np.testing.assert_allclose(np.ptp(tall.shape.vertices, axis=0), (0.2, 0.1, 1.0), atol=1e-6)
+
+
+@pytest.mark.parametrize("choice", [{"scenes": 2}, {"settings": ["test=3"]}])
+def test_a_scene_of_ones_own_has_no_settings_of_the_task(tmp_path, choice):
+    with pytest.raises(ConfigError, match="scene of your own"):
+        Design(looking((0, 0, 0))).simulate(tmp_path / "robot.xml", rays=9, **choice)
 
 
 def test_a_ball_that_turns_up_elsewhere_is_seen_there():

@@ -2,7 +2,9 @@
 
 import csv
 import math
+import re
 import shlex
+from dataclasses import replace
 from html.parser import HTMLParser
 from itertools import pairwise
 from xml.etree import ElementTree
@@ -176,6 +178,23 @@ def test_nothing_in_a_name_becomes_markup(tmp_path):
     assert len({row["sensor"] for row in rows}) == len(design.sensors)
     assert {row["pattern"] for row in rows} == {"any rays: --format csv lists them"}
     assert [one.name for one in mounted_parts(design)] == [row["sensor"] for row in rows]
+
+
+def test_no_link_is_the_one_that_it_is_mounted_on(tmp_path):
+    design, rays = rig()
+    sensors = tuple(replace(one, name=name) for one, name in zip(design.sensors, ("base", "s", "t", "u"), strict=False))
+    EXPORTERS["mounts"].write(replace(design, sensors=sensors, mount="base_link"), rays, tmp_path)
+    links = [link.get("name") for link in ElementTree.parse(tmp_path / "mounts.urdf").findall("link")]
+    assert len(set(links)) == len(links) == len(sensors) + 1
+
+
+def test_labels_of_many_sensors_stay_on_the_sheet(tmp_path):
+    poses = [Pose(np.array([0.01 * number, 0.02 * number, 0.0])) for number in range(40)]
+    written(part_design(find_part("vl53l8cx"), poses), tmp_path)
+    text = (tmp_path / "mounts.html").read_text(encoding="utf-8")
+    places = re.findall(r'<text x="([-\d.]+)" y="([-\d.]+)" text-anchor="end"', text)
+    assert len(places) > 80
+    assert all(0 <= float(x) <= 340 and 0 <= float(y) <= 270 for x, y in places)
 
 
 def test_it_has_no_frame_rate(tmp_path):
