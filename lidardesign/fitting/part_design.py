@@ -262,7 +262,7 @@ def _timed(scenes: Iterable[Scene], count: int, label: str, progress: Callable[[
     """Scenes as they come, with the time left for so many of them in a label."""
     began = perf_counter()
     for number, scene in enumerate(itertools.islice(scenes, count)):
-        left = f", about {(perf_counter() - began) * (count - number) / number:.0f} s left" if number else ""
+        left = f", about {(perf_counter() - began) * (count - number) / number:.0f} s for these" if number else ""
         progress(f"{label}{left}")
         yield scene
 
@@ -321,7 +321,7 @@ def _judge_sets(
         began = perf_counter()
         scenes.score(trials, number)
         left = (perf_counter() - began) * (few - number)
-        progress(f"judging {len(trials)} sets of parts, about {left:.0f} s left")
+        progress(f"judging {len(trials)} sets of parts on the first {few} scenes, about {left:.0f} s for these")
     if all(abs(one.scores.mean() - metric.worst) <= metric.tolerance for one in trials):
         notes("none of the sets measures anything in these scenes: the best by the proxy is taken")
         return [sets[0] for sets in by_number]
