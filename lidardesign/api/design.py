@@ -37,7 +37,7 @@ from lidardesign.task import scoring_settings
 from lidardesign.workers import check_workers, opened_workers
 
 if TYPE_CHECKING:
-    from lidardesign.clouds.seen import SeenScene
+    from lidardesign.clouds.seen import Measuring, SeenScene
     from lidardesign.report.figures import Figure
 
 MOST_SCENES = 10_000
@@ -255,7 +255,6 @@ class Design(DesignSource):
         scenes: int = 1,
         rays: int | None = None,
         detector: str = "ideal",
-        effects: str = "auto",
         settings: Sequence[str] | Mapping[str, Any] = (),
         seed: int | None = None,
         scale: float = 1.0,
@@ -268,7 +267,6 @@ class Design(DesignSource):
             scenes: How many held-out scenes.
             rays: Rays per frame; its own by default, or the largest number of its task.
             detector: The name of a detector, or its file.
-            effects: auto, all, none, or names of effects between commas.
             settings: Settings of the task, for scenes other than the learned ones.
             seed: Seed of all random numbers; the run's by default.
             scale: Factor from the unit of a mesh to metres (0.001 for mm).
@@ -278,24 +276,24 @@ class Design(DesignSource):
             ConfigError: An unknown choice, or no run to take scenes from.
             DataError: The file of the scene cannot be read.
         """
-        choices: dict[str, Any] = {"detector": detector, "effects": effects, "settings": settings, "seed": seed}
-        return self.seen(scene, scenes=scenes, rays=rays, scale=scale, notes=notes, **choices)
+        from lidardesign.clouds.seen import Measuring
+
+        measuring = Measuring(detector, seed)
+        return self.seen(measuring, scene, scenes=scenes, rays=rays, settings=settings, scale=scale, notes=notes)
 
     def seen(
         self,
+        measuring: Measuring,
         scene: Path | str | None,
         *,
         scenes: int,
         rays: int | None,
-        detector: str,
-        effects: str,
         settings: Sequence[str] | Mapping[str, Any],
-        seed: int | None,
         scale: float,
         notes: Notes,
     ) -> list[SeenScene]:
         """As `simulate`, with errors in terms of command-line options."""
-        from lidardesign.clouds.seen import Measuring, scene_of_file, seen_in_file, seen_scenes
+        from lidardesign.clouds.seen import scene_of_file, seen_in_file, seen_scenes
 
         check_number(scenes, "--scenes", 1, MOST_SCENES, whole=True)
         count, spec = self.usual_count(notes) if rays is None else rays, self.specification
@@ -303,7 +301,6 @@ class Design(DesignSource):
             run = need_run(self.run, self.name)
             for note in run.input_notes():
                 notes(note)
-            measuring = Measuring(detector, effects, seed)
             found = seen_scenes(run, spec, count, scenes, measuring, settings_texts(settings))
             if len(found) < scenes:
                 notes(f"there are {len(found)} held-out scenes; --set test=N makes more, where the task has that key")
@@ -313,9 +310,9 @@ class Design(DesignSource):
             raise ConfigError(f"{fault} together with a scene of your own", where="--scene", allowed="held-out scenes")
         if spec.following(count) is not None:
             notes("in a scene of your own the best single pattern fires")
-        seed = self.run.config.seed if seed is None and self.run is not None else seed
-        own = scene_of_file(Path(scene), spec.mount, scale)
-        return [seen_in_file(own, spec, count, Measuring(detector, effects, seed))]
+        if measuring.seed is None and self.run is not None:
+            measuring = replace(measuring, seed=self.run.config.seed)
+        return [seen_in_file(scene_of_file(Path(scene), spec.mount, scale), spec, count, measuring)]
 
     def figure(self, count: int | None = None) -> Figure:
         """Its sensors in space, with fields of view and gates, and its rays where their number is given (plotly)."""

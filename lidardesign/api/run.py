@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from lidardesign.density.training.learned import LearnedDensity
     from lidardesign.samples import Verdict
 
+FIXED_BASELINES = ("uniform", "bounding", "silhouette", "lloyd", "greedy")  # with the same rays in every scene
 FIGURES = ("ess", "kl_nats", "log_z", "coverage", "misplaced")
 
 
@@ -256,26 +257,30 @@ class Run(RunFolder):
         from lidardesign.scoring.evaluation.entries import entries_of
 
         check_baseline(baseline)
-        name = FitOptions(name=name or f"{baseline}-rays").name
-        path = self.design_path(str(name))
+        name = name or f"{baseline}-rays"
+        FitOptions(name=name)  # refuses what no design may be called
+        path = self.design_path(name)
         if path.exists():
             raise ConfigError(f"{path} is there already", where="name", allowed="another name")
         numbers = sorted(self.task.defaults.rays)
         count = numbers[len(numbers) // 2] if rays is None else rays
         check_number(count, "--rays", 1, MOST_RAYS, whole=True)
-        allowed = "uniform, bounding, silhouette, lloyd, greedy"
         found = []
-        if baseline in allowed.split(", "):
+        if baseline in FIXED_BASELINES:
             request = evaluation_request(self, [], [count], [baseline], seed)
             found = entries_of(replace(request, equal_bandwidth=False))
         if len(found) != 1 or len(found[0].positions) > 1:
-            raise ConfigError(f"{baseline} has no fixed list of {count} rays here", where="baseline", allowed=allowed)
+            raise ConfigError(
+                f"{baseline} has no fixed list of {count} rays here",
+                where="baseline",
+                allowed=", ".join(FIXED_BASELINES),
+            )
         fired = found[0].positions[0].as_angles()
         sensor = RigSensor("s0", fired.origin_m, fired.azimuth_rad, fired.elevation_rad, fired.gate_m)
         design = rig_design(Rig(f"baseline {baseline}", [sensor], [], ""), Path(baseline), None)
         mount, origin = mount_of(self.task, self.config.task), relative_folder(self.folder, path)
         origin = {**design.provenance, "task": self.task.name, "run": origin}
-        made = Design(replace(design, name=path.stem, mount=mount, provenance=origin), self)
+        made = Design(replace(design, name=name, mount=mount, provenance=origin), self)
         made.save()
         return made
 

@@ -44,9 +44,9 @@ def write_clouds(seen: Sequence[SeenScene], path: Path, form: str) -> list[str]:
     files = {}
     for number, one in enumerate(seen):
         scene = f"{number:03d}_{identifier(one.scene.name)}"
-        for frame in range(len(one.returns)):
-            cloud = one.cloud(frame)
-            files[f"{scene}_{frame:03d}.{form}"] = _ply(cloud) if form == "ply" else _pcd(cloud)
+        for entry in range(len(one.returns)):
+            cloud = one.cloud(entry)
+            files[f"{scene}_{entry:03d}.{form}"] = _ply(cloud) if form == "ply" else _pcd(cloud)
         vertices, faces = one.unseen()
         files[f"{scene}_unseen.ply"] = _surface(vertices, faces)
     return write_folder(path, files)
@@ -90,8 +90,8 @@ def _mcap(seen: Sequence[SeenScene]) -> bytes:
     frames = [(f"{one.name}_link", one.sensor.origin_m, quaternion(*one.roll_pitch_yaw_rad)) for one in mounted]
     clouds, time_ns = [], 0
     for one in seen:
-        for number in range(len(one.returns)):
-            clouds.append((time_ns, cloud_message(one.cloud(number), time_ns, parent)))
+        for entry in range(len(one.returns)):
+            clouds.append((time_ns, cloud_message(one.cloud(entry), time_ns, parent)))
             # clouds do not overlap in time
             time_ns += round(NANOSECONDS / min(one.scene.frame_rate_hz, DEFAULT_RATE_HZ))
     return mcap_content(clouds, transforms_message(parent, frames))

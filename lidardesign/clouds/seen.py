@@ -15,7 +15,7 @@ from lidardesign.report.scene_figure import own_triangles, scene_bounds
 from lidardesign.run.clock import phase
 from lidardesign.run_folder import RunFolder
 from lidardesign.scenes.casting import SceneCaster
-from lidardesign.scenes.mesh_files import SUFFIXES, load_mesh
+from lidardesign.scenes.mesh_files import SUFFIXES, Y_UP, load_mesh
 from lidardesign.scenes.rays import Returns
 from lidardesign.scenes.scene import Body, Round, Scene, inverse_rigid
 from lidardesign.scoring.evaluation.entries import entries_of
@@ -25,7 +25,7 @@ from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.sensor import Sensor
 from lidardesign.simulate.calibration import with_part_light
 from lidardesign.simulate.detector.files import load_detector
-from lidardesign.simulate.plan import Planner, Tolerance, parse_effects
+from lidardesign.simulate.plan import Planner
 from lidardesign.simulate.returns import build_casters
 
 # Columns of a cloud with their types in files; points are rounded last.
@@ -34,7 +34,6 @@ COLUMNS = (
     ("occluder", "u1"), ("ray", "<u4"),
 )  # fmt: skip
 NANOSECONDS = 1e9
-Y_UP = (".glb", ".gltf")  # files that have y up, by their format
 LONGEST_SHARE, MOST_TRIANGLES = 1 / 16, 500_000  # of a body's extent, in which what is seen is told; of a body
 
 
@@ -175,18 +174,15 @@ class Measuring:
 
     Arguments:
         detector: The name of a detector, or its file.
-        effects: auto, all, none, or names of effects between commas.
         seed: Root of the scenes and of the effects' random numbers; None: the run's.
     """
 
     detector: str = "ideal"
-    effects: str = "auto"
     seed: int | None = None
 
     def planner(self) -> Planner:
-        """The rule by which effects are chosen."""
-        detector = load_detector(self.detector)
-        return Planner(detector, parse_effects(self.effects), Tolerance.of(detector))
+        """The rule by which effects are chosen: those that a scene calls for."""
+        return Planner(load_detector(self.detector))
 
 
 @phase("simulation")

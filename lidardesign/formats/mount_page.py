@@ -190,7 +190,8 @@ def _transforms(mounted: Sequence[MountedPart], parent: str) -> list[str]:
 # Views from three sides: their name, the axes to the right and upwards, and the axis and sign towards the viewer.
 VIEWS = (("from the front (+x)", 1, 2, 0, 1), ("from the right (-y)", 0, 2, 1, -1), ("from above (+z)", 0, 1, 2, 1))
 WIDTH, HEIGHT, EDGE = 340.0, 270.0, 58.0
-ARROW, UPRIGHT, SEEN = 30.0, 12.0, 0.25  # lengths of arrows and marks of what is up; shares below which they are dots
+ARROW, UPRIGHT = 30.0, 12.0  # lengths of arrows and of marks of what is up
+HEAD_ON = 0.25  # the share of an arrow across the view below which it is a ring
 APART = 11.0  # of numbers along an edge
 SAME_MM = 0.05
 
@@ -233,7 +234,7 @@ def _sketch(mounted: Sequence[MountedPart], title: str, across: int, up: int, de
 
 def _arrow(x: float, y: float, looks: np.ndarray, nearer: float) -> str:
     """An arrow along the optical axis; a dot where it points at the viewer, a cross where it points away."""
-    if np.hypot(*looks) < SEEN:
+    if np.hypot(*looks) < HEAD_ON:
         ring = f'<circle cx="{x:.1f}" cy="{y:.1f}" r="7"/>'
         away = f'<path d="M{x - 5:.1f} {y - 5:.1f}l10 10m-10 0l10 -10"/>'
         return f'<g class="look">{ring}{away if nearer < 0 else ""}</g>'
@@ -339,9 +340,8 @@ def _poses(mounted: Sequence[MountedPart]) -> str:
         place = [f"{value + 0.0:.1f}" for value in np.round(MM_PER_M * one.sensor.origin_m, 1)]
         angles = [f"{round(math.degrees(angle), 2) + 0.0:.2f}" for angle in one.angles_rad]
         vectors = [one.axes[0], one.axes[2], quaternion(*one.roll_pitch_yaw_rad)]
-        rows.append(
-            [one.name, *place, *angles, *(" ".join(f"{v + 0.0:.4f}" for v in np.round(one, 4)) for one in vectors)]
-        )
+        numbers = [" ".join(f"{value + 0.0:.4f}" for value in np.round(vector, 4)) for vector in vectors]
+        rows.append([one.name, *place, *angles, *numbers])
     return _table(headings, rows, "Places in mm, angles in degrees.", text=(0,))
 
 
@@ -382,12 +382,12 @@ def _parts_table(mounted: Sequence[MountedPart]) -> str:
 
 def _before_drilling(mounted: Sequence[MountedPart]) -> list[str]:
     """What has to be found out before holes are drilled."""
-    open_ = [
+    questions = [
         ("which side is up", "up"),
         ("where rays start on the part", "origin"),
         ("where the first zone looks", "zone_0"),
     ]
-    missing = [text for text, name in open_ if any(one.stated(name) == UNKNOWN for one in mounted)]
+    missing = [text for text, name in questions if any(one.stated(name) == UNKNOWN for one in mounted)]
     found = []
     if missing and any(one.sensor.part is not None for one in mounted):
         found.append(f"<p><b>Before you drill</b>, find out for each part marked unknown: {'; '.join(missing)}.</p>")

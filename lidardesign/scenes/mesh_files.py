@@ -198,6 +198,7 @@ def _alone(values: np.ndarray) -> np.ndarray:
 
 
 SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
+Y_UP = (".glb", ".gltf")  # by their format; the others do not say which axis points up
 READERS = {".obj": read_obj, ".off": read_off, ".stl": read_stl}
 # a triangle is degenerate if its double area is a smaller share of its longest edge squared
 FLATTEST_TRIANGLE = ROUNDING

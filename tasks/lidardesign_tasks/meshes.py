@@ -21,7 +21,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.scenes.mesh_files import COLOURS, SUFFIXES, Painted, list_mesh_files, load_mesh
+from lidardesign.scenes.mesh_files import COLOURS, SUFFIXES, Y_UP, Painted, list_mesh_files, load_mesh
 from lidardesign.scenes.rays import Returns
 from lidardesign.scenes.scene import Body, Mesh, Scene, Sign
 from lidardesign.space import FARTHEST_M, DesignSpace
@@ -43,7 +43,6 @@ from lidardesign_tasks.units import doubtful_meshes, doubtful_motion
 from lidardesign_tasks.view import space_around, space_around_box
 
 Axis = Literal["format", "x", "y", "z"]
-Y_UP = (".glb", ".gltf")  # by their format
 # the file's axes that become the world's x, y, z: a rotation of the up axis to z
 WORLD_AXES = {"x": [1, 2, 0], "y": [2, 0, 1], "z": [0, 1, 2]}
 RELATIVE_JITTER = 0.02  # of the largest extent, where no shift is given

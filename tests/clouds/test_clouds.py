@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -210,7 +211,7 @@ def test_a_mesh_and_a_robot_of_ones_own_are_scenes(tmp_path):
 
 
 def test_mcap_says_what_is_missing(seen, tmp_path, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "mcap.writer", None)
+    monkeypatch.setitem(sys.modules, "mcap.writer", None)
     with pytest.raises(ConfigError, match="mcap is not installed"):
         write_clouds(seen, tmp_path / "a.mcap", "mcap")
 

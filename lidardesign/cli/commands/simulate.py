@@ -41,9 +41,6 @@ def simulate(
     ] = 1.0,
     rays: options.RayCount = None,
     detector: options.Detector = "ideal",
-    effects: Annotated[
-        str, typer.Option("--effects", metavar="auto|all|none|LIST", help="Physical effects, as of evaluate.")
-    ] = "auto",
     overrides: options.SceneSettings = None,
     seed: options.Seed = None,
     json: options.Json = False,
@@ -56,6 +53,7 @@ def simulate(
             from lidardesign.api.design import collect_designs
             from lidardesign.clouds.files import FORMATS as KNOWN
             from lidardesign.clouds.files import write_clouds
+            from lidardesign.clouds.seen import Measuring
 
         if format_ not in KNOWN:
             raise ConfigError(f"unknown format {format_!r}", where="--format", allowed=", ".join(KNOWN))
@@ -65,10 +63,9 @@ def simulate(
             raise ConfigError(f"{target} has {len(designs)} designs", where="RUN|DESIGN", allowed=f"one of {names}")
         announce([out], output)
         check_outputs({"--out": out}, [scene] if scene else [], () if format_ == "mcap" else ("--out",))
-        seen = designs[0].seen(
-            scene, scenes=scenes, rays=rays, detector=detector, effects=effects, settings=overrides or (), seed=seed,
-            scale=scale, notes=output.remark,
-        )  # fmt: skip
+        measuring = Measuring(detector, seed)
+        choices = {"scenes": scenes, "rays": rays, "settings": overrides or (), "scale": scale}
+        seen = designs[0].seen(measuring, scene, **choices, notes=output.remark)
         with phase("writing"):
             notes = write_clouds(seen, out, format_)
         for note in notes:
