@@ -41,7 +41,7 @@ def chosen(options: Any, kinds: int) -> dict[str, Any]:
     run, samples = RunFolder.open(options.run), load_samples(options.run)
     training = TrainingScenes(run, 0)
     marks = [time.process_time()]
-    placed = proposed(named_parts("catalog")[:kinds], Constraints(), samples, 0)
+    placed = proposed(named_parts("catalog")[:kinds], Constraints(), options.count, samples, 0)
     marks.append(time.process_time())
     bundle = PartBundle(placed, 60_000 // options.count, next(training.scenes(CHOICE)).frames)
     marks.append(time.process_time())

@@ -23,7 +23,7 @@ API = {"constrain", "evaluate", "evaluate_seeds", "fit", "learn"}
 ROOMS = (
     "errors", "numerics", "estimates", "run", "space", "scenes", "samples", "task", "registry", "config", "run_folder",
     "workers", "density", "sensors", "parts", "constraints", "mixture", "simulate", "rays", "formats", "scoring",
-    "fitting", "report", "clouds", "contract", "api", "cli", "__main__",
+    "fitting", "report", "clouds", "contract", "api", "studio", "cli", "__main__",
 )  # fmt: skip
 
 # Where a library may be imported, by the beginnings of module names; nowhere else.
@@ -40,6 +40,8 @@ HOMES = {
     "rich": ("cli.",),
     "plotly": ("report.",),
     "matplotlib": (),
+    "viser": ("studio.",),
+    "websockets": ("studio.server",),
     "distributed": ("workers.",),
     "dask": ("workers.",),
     # it can abort its process: only the one of its own imports it

@@ -12,6 +12,8 @@ from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from lidardesign.api.export import (
     DesignSource,
     Exported,
@@ -30,6 +32,7 @@ from lidardesign.run.files import run_lock
 from lidardesign.run.manifest import write_recorded
 from lidardesign.run_folder import Notes, RunFolder, ignore, log_note, settings_texts
 from lidardesign.scenes.rays import Rays
+from lidardesign.scenes.scene import Scene
 from lidardesign.sensors.compare import outside_space
 from lidardesign.sensors.design import DesignSpec, certificates_of
 from lidardesign.sensors.design_file import design_text, save_design
@@ -184,6 +187,16 @@ class Design(DesignSource):
         request = FitRequest.resolve(run, options, self.specification, notes=notes)
         return Design.fitted(request, workers=workers, notes=notes, progress=progress)
 
+    def remounted(self, sensor: int, origin_m: Sequence[float], frame: np.ndarray) -> Design:
+        """The design with one sensor at another pose; its rays go with it, and nothing is chosen again.
+
+        Arguments:
+            sensor: The sensor's number.
+            origin_m: Its new place [m].
+            frame: Its new axes, rows forward, horizontal, vertical, shape (3, 3).
+        """
+        return Design(self.specification.remounted(sensor, np.asarray(origin_m), frame), self.run)
+
     @names_arguments
     def rays(self, count: int | None = None, *, at: Mapping[str, float] | None = None, notes: Notes = log_note) -> Rays:
         """The explicit rays that it fires: origins, directions and gates, by ray.
@@ -250,7 +263,7 @@ class Design(DesignSource):
     @names_arguments
     def simulate(
         self,
-        scene: Path | str | None = None,
+        scene: Path | str | Sequence[Scene] | None = None,
         *,
         scenes: int = 1,
         rays: int | None = None,
@@ -263,7 +276,8 @@ class Design(DesignSource):
         """What it sees in held-out scenes, with the effects that they call for, or in a mesh or robot of your own.
 
         Arguments:
-            scene: A mesh file, or a MuJoCo model in its initial configuration; None: held-out scenes of its run.
+            scene: A mesh file, a MuJoCo model in its initial configuration, or scenes of its run, as `run.scenes` gives
+                them; None: held-out ones.
             scenes: How many held-out scenes.
             rays: Rays per frame; its own by default, or the largest number of its task.
             detector: The name of a detector, or its file.
@@ -284,7 +298,7 @@ class Design(DesignSource):
     def seen(
         self,
         measuring: Measuring,
-        scene: Path | str | None,
+        scene: Path | str | Sequence[Scene] | None,
         *,
         scenes: int,
         rays: int | None,
@@ -305,6 +319,8 @@ class Design(DesignSource):
             if len(found) < scenes:
                 notes(f"there are {len(found)} held-out scenes; --set test=N makes more, where the task has that key")
             return found
+        if not isinstance(scene, Path | str):
+            return seen_scenes(need_run(self.run, self.name), spec, count, scene, measuring, settings_texts(settings))
         if settings or scenes != 1 or spec.condition is not None:
             fault = "a design whose rays follow a condition" if spec.condition is not None else "--set or --scenes"
             raise ConfigError(f"{fault} together with a scene of your own", where="--scene", allowed="held-out scenes")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from importlib import import_module
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Any
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from lidardesign.density.training.learned import LearnedDensity
     from lidardesign.samples import Verdict
 
+MOST_PORT = 65_535
 FIXED_BASELINES = ("uniform", "bounding", "silhouette", "lloyd", "greedy")  # with the same rays in every scene
 FIGURES = ("ess", "kl_nats", "log_z", "coverage", "misplaced")
 
@@ -236,10 +238,10 @@ class Run(RunFolder):
         }
 
     @names_arguments
-    def save_baseline(
+    def baseline(
         self, baseline: str, *, rays: int | None = None, name: str | None = None, seed: int | None = None
     ) -> Design:
-        """The design that fires the rays of a baseline, as `evaluate` has it at this number of rays alone; it is saved.
+        """The design that fires the rays of a baseline, as `evaluate` has it at this number of rays; not saved yet.
 
         Arguments:
             baseline: Its name, as "greedy" or "bounding".
@@ -248,8 +250,7 @@ class Run(RunFolder):
             seed: Seed of all random numbers; the run's by default.
 
         Raises:
-            ConfigError: No such baseline, or one without rays of its own that stay the same in every scene; a design of
-                this name is there.
+            ConfigError: No such baseline, or one without rays of its own that stay the same in every scene.
         """
         from lidardesign.api.scores import evaluation_request
         from lidardesign.formats.rig import Rig, RigSensor, rig_design
@@ -259,9 +260,6 @@ class Run(RunFolder):
         check_baseline(baseline)
         name = name or f"{baseline}-rays"
         FitOptions(name=name)  # refuses what no design may be called
-        path = self.design_path(name)
-        if path.exists():
-            raise ConfigError(f"{path} is there already", where="name", allowed="another name")
         numbers = sorted(self.task.defaults.rays)
         count = numbers[len(numbers) // 2] if rays is None else rays
         check_number(count, "--rays", 1, MOST_RAYS, whole=True)
@@ -278,11 +276,9 @@ class Run(RunFolder):
         fired = found[0].positions[0].as_angles()
         sensor = RigSensor("s0", fired.origin_m, fired.azimuth_rad, fired.elevation_rad, fired.gate_m)
         design = rig_design(Rig(f"baseline {baseline}", [sensor], [], ""), Path(baseline), None)
-        mount, origin = mount_of(self.task, self.config.task), relative_folder(self.folder, path)
+        mount, origin = mount_of(self.task, self.config.task), relative_folder(self.folder, self.design_path(name))
         origin = {**design.provenance, "task": self.task.name, "run": origin}
-        made = Design(replace(design, name=name, mount=mount, provenance=origin), self)
-        made.save()
-        return made
+        return Design(replace(design, name=name, mount=mount, provenance=origin), self)
 
     def _next_commands(self, designs: Sequence[Mapping[str, Any]], *, finished: bool) -> list[str]:
         """Command lines of the next steps."""
@@ -377,6 +373,30 @@ class Run(RunFolder):
         targets = [design if isinstance(design, Design) else Path(design) for design in chosen]
         scores = ScoreRequest.resolve(targets, options, self, notes).score(progress)
         return scores.with_accuracy(progress) if options.accuracy else scores
+
+    @names_arguments
+    def studio(self, design: Design | None = None, *, port: int | None = None) -> Any:
+        """Open a page on this machine on which sensors are moved, fitted and scored; in a notebook it is shown inside.
+
+        Arguments:
+            design: The design to begin with; the last that is saved by default.
+            port: The port to listen on; any that is free by default.
+
+        Returns:
+            The page: its `address`, `wait()` and `stop()`.
+
+        Raises:
+            ConfigError: viser is not installed, or the port is taken.
+        """
+        try:
+            # above this room, which does not depend on it
+            room = import_module("lidardesign.studio.studio")
+        except ImportError as error:
+            hint = "pip install 'lidardesign[studio]'"
+            raise ConfigError(f"the studio needs {error.name}", where="studio", hint=hint) from None
+        if port is not None:
+            check_number(port, "--port", 1, MOST_PORT, whole=True)
+        return room.Studio(self, design, port)
 
     def __repr__(self) -> str:
         return f"<Run {self.folder}: task {self.task.name}, preset {self.config.preset}, seed {self.config.seed}>"

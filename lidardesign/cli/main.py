@@ -19,6 +19,7 @@ from lidardesign.cli.commands.fit import constrain, fit
 from lidardesign.cli.commands.learn import learn
 from lidardesign.cli.commands.show import show
 from lidardesign.cli.commands.simulate import simulate
+from lidardesign.cli.commands.studio import studio
 from lidardesign.cli.commands.tasks import tasks_app
 from lidardesign.cli.terminal.options import StrictCommand
 from lidardesign.cli.terminal.output import (
@@ -70,6 +71,10 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "lidardesign evaluate rig.csv other.csv --in runs/face --baseline none",
         "lidardesign evaluate runs/arm --baseline occupancy --workers 8",
     ),
+    "studio": (
+        "lidardesign studio runs/face",
+        "lidardesign studio runs/arm runs/arm/designs/mounted.yaml --port 8080 --no-browser",
+    ),
     "simulate": (
         "lidardesign simulate runs/face --scenes 20 --format mcap --out faces.mcap",
         "lidardesign simulate free.yaml --scene cup.stl --scale 0.001 --out cup",
@@ -101,6 +106,7 @@ PAGES = {
     "fit": "design-file.md, selection.md, parts.md, importance.md",
     "constrain": "constraints.md, catalog.md",
     "evaluate": "evaluate.md, baselines.md, detectors.md, shell.md",
+    "studio": "studio.md, constraints.md",
     "simulate": "formats.md, detectors.md",
     "export": "formats.md, design-file.md",
     "capture": "captures.md",
@@ -133,7 +139,7 @@ app = typer.Typer(
 app.add_typer(tasks_app, name="tasks", context_settings=SETTINGS)
 app.add_typer(catalog_app, name="catalog", context_settings=SETTINGS)
 app.add_typer(config_app, name="config", context_settings=SETTINGS)
-for subcommand in (learn, fit, constrain, evaluate, simulate, export, capture, show):
+for subcommand in (learn, fit, constrain, evaluate, studio, simulate, export, capture, show):
     app.command()(subcommand)
 for prefix, group in (("", app), ("tasks ", tasks_app), ("catalog ", catalog_app), ("config ", config_app)):
     for registered in group.registered_commands:

@@ -187,31 +187,34 @@ class Measuring:
 
 @phase("simulation")
 def seen_scenes(
-    run: RunFolder, design: DesignSpec, count: int, scenes: int, measuring: Measuring, settings: Sequence[str] = ()
+    run: RunFolder,
+    design: DesignSpec,
+    count: int,
+    scenes: int | Sequence[Scene],
+    measuring: Measuring,
+    settings: Sequence[str] = (),
 ) -> list[SeenScene]:
-    """What a design sees in the first held-out scenes of a run, as `evaluate` simulates it.
+    """What a design sees in scenes of a run, as `evaluate` simulates it.
 
     Arguments:
         run: The run.
         design: The design.
         count: Rays per frame.
-        scenes: How many scenes.
+        scenes: The scenes, or how many of the held-out ones.
         measuring: How it measures.
         settings: Keys of the task with values, for scenes other than the learned ones.
     """
     config = with_task_settings(run.task, run.config, settings) if settings else run.config
     run, planner = replace(run, config=config), measuring.planner()
     seed = config.seed if measuring.seed is None else measuring.seed
+    chosen = run.scenes("test", seed)[:scenes] if isinstance(scenes, int) else scenes
     request = EvaluationRequest(
         task=run.task, config=config.task, space=config.space, seed=seed, designs=[design], rays=[count], baselines=(),
-        equal_bandwidth=False, test=run.scenes("test", seed),
+        equal_bandwidth=False, test=chosen,
         planner=replace(planner, tolerance=planner.tolerated.within(run.metric)),
     )  # fmt: skip
     entry = entries_of(request)[0]
-    return [
-        _seen(design, scene, entry.lit_in(number), request.planner, seed)
-        for number, scene in enumerate(request.test[:scenes])
-    ]
+    return [_seen(design, scene, entry.lit_in(number), request.planner, seed) for number, scene in enumerate(chosen)]
 
 
 @phase("simulation")

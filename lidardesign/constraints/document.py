@@ -49,6 +49,7 @@ Positive = Annotated[float, Field(ge=SHORTEST_M, le=FARTHEST_M)]
 Angle = Annotated[float, Field(ge=-360 * MOST_TURNS, le=360 * MOST_TURNS)]
 # The boxes between excluded ones grow faster than their number: with so many a fit still takes seconds.
 MOST_EXCLUDED = 32
+MOST_ROLL_DEG = 45.0  # of a fitted field of view: beyond it is the same with its two angles exchanged
 # Responsibilities of so many sensors over all samples fill some 100 MB.
 MOST_FITTED = 1000
 Count = Annotated[int, Field(ge=1, le=MOST_FITTED)]
@@ -141,10 +142,13 @@ class Origin(_Keys):
 
 
 class RollRange(_Keys):
-    """Bounds on a roll about the boresight, which further rolls equal with the two fields exchanged [degrees]."""
+    """Bounds on a roll about the boresight [degrees].
 
-    min: Annotated[float, Field(ge=-45, le=45)] | None = None
-    max: Annotated[float, Field(ge=-45, le=45)] | None = None
+    Beyond 45 degrees for parts alone: a fitted field is the same with its two angles exchanged.
+    """
+
+    min: Annotated[float, Field(ge=-180, le=180)] | None = None
+    max: Annotated[float, Field(ge=-180, le=180)] | None = None
 
 
 class Boresight(_Keys):

@@ -17,7 +17,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from lidardesign.constraints.document import Constraints, SensorRules
+from lidardesign.constraints.document import MOST_ROLL_DEG, Constraints, SensorRules
 from lidardesign.constraints.origins import free_boxes, most_mounted, mounts_of, snap_place_to_space
 from lidardesign.errors import InfeasibleError
 from lidardesign.numerics import COARSE_SLACK, SLACK
@@ -97,7 +97,7 @@ def check_feasible(
                     text = f"{DIMENSIONS[axis]} of a mount is {value:g}, beyond {beyond[0].value:g}"
                     _refuse(text, [f"{name}[{number}]", beyond[0].name])
         _check_excluded(rules, space)
-        _check_boresight(rules, space)
+        _check_boresight(rules, space, are_parts=constraints.parts is not None)
         _check_field(rules, space)
         _check_gate(rules, space)
     _check_budget(constraints, needed, least, rays)
@@ -161,7 +161,7 @@ def _check_excluded(rules: SensorRules, space: DesignSpace) -> None:
     _refuse(f"{boxes} {place}", [f"{name}[{alone[0]}]" if alone else name, *bounds])
 
 
-def _check_boresight(rules: SensorRules, space: DesignSpace) -> None:
+def _check_boresight(rules: SensorRules, space: DesignSpace, *, are_parts: bool) -> None:
     elevation, azimuth = rules.boresight.elevation_deg, rules.boresight.azimuth_deg
     low_name, high_name = (rules.path(f"boresight.elevation_deg.{end}") for end in ("min", "max"))
     if elevation.min is not None and elevation.max is not None and elevation.min > elevation.max:
@@ -175,6 +175,8 @@ def _check_boresight(rules: SensorRules, space: DesignSpace) -> None:
     names = [rules.path(f"boresight.roll_deg.{end}") for end in ("min", "max") if getattr(roll, end) is not None]
     if low > high:
         _refuse(f"a roll of at least {low:g} and at most {high:g} degrees", names)
+    if not are_parts and (low > MOST_ROLL_DEG or high < -MOST_ROLL_DEG):
+        _refuse("beyond 45 degrees a field is the same with its two angles exchanged", names)
     if not {AZIMUTH, ELEVATION} <= set(space.free) and not low <= 0 <= high:
         _refuse("the roll is 0 where the design space holds all rays in a plane", [*names, "space"])
     ends = [end for end in ("min", "max") if getattr(azimuth, end) is not None]

@@ -24,7 +24,15 @@ from lidardesign.constraints.feasibility import BandwidthBudget, check_feasible
 from lidardesign.constraints.origins import inside_excluded, mounts_of, origin_box
 from lidardesign.errors import BackgroundNote, ConfigError, DataError, InfeasibleError
 from lidardesign.fitting.part_sets import ChosenSet, SetLimits, choose_set, further_sets, value_of
-from lidardesign.fitting.part_shapes import PartBundle, PlacedPart, broken_keys, part_table, parts_inform, shapes_of
+from lidardesign.fitting.part_shapes import (
+    PartBundle,
+    PartShape,
+    PlacedPart,
+    broken_keys,
+    part_table,
+    parts_inform,
+    shapes_of,
+)
 from lidardesign.fitting.request import FitRequest, FitResult
 from lidardesign.fitting.trials import HeldBackScenes, Trial, best_of
 from lidardesign.mixture.bounds import bounds_of, clip_azimuth
@@ -107,7 +115,8 @@ def choose_parts(
         )
     planner = request.planner
     detector = IDEAL if planner is None else planner.detector
-    placed = _covered(proposed(_known_parts(constraints, notes), constraints, samples, request.seed), detector, notes)
+    parts = _known_parts(constraints, notes)
+    placed = _covered(proposed(parts, constraints, count, samples, request.seed), detector, notes)
     budget = BandwidthBudget.of(constraints, request.rays)
     most = (budget.rays or MOST_FILE_RAYS) // count
     limits = _limits(placed, constraints, count, most, budget)
@@ -126,7 +135,9 @@ def choose_parts(
     coverage, chosen, trained = _enough_scenes(bundle, limits, inform, training, most_scenes, progress)
 
     def trial(members: tuple[int, ...], bound: float) -> SetTrial:
-        design = _design(request.name, constraints, [placed[member] for member in members], budget.rays)
+        # sensors come in the order of their entries
+        ordered = sorted((placed[member] for member in members), key=lambda one: one.entry)
+        design = _design(request.name, constraints, ordered, budget.rays)
         fired = (with_part_light(design.rays(), design, detector),)
         return SetTrial(len(members), fired, members=members, bound=bound, design=design)
 
@@ -138,6 +149,13 @@ def choose_parts(
         notes(_row_text(row, request.run.metric))
     sign = 1.0 if request.run.metric.better == "lower" else -1.0
     winner = min(found, key=lambda one: sign * one.scores[: min(len(one.scores) for one in found)].sum())
+    missing = {*range(len(constraints.each))} - {placed[member].entry for member in winner.members}
+    if missing:
+        raise InfeasibleError(
+            f"no part where each[{min(missing)}] wants it sees anything that the others do not",
+            conflicts=[f"each[{min(missing)}]"],
+            hint="another place or boresight for it, or fewer entries",
+        )
     if len(winner.members) < count and not request.fewest:
         notes(f"{len(winner.members)} of {count} parts: no other part adds anything or fits the bounds")
     parts = [placed[member].part for member in winner.members]
@@ -369,9 +387,15 @@ def _limits(
             np.array([wanted.each[name].max if name in wanted.each else count for name in names]),
         )
     ]
-    if constraints.origin.mounts_m:
+    mounts = {tuple(place) for rules in constraints.rules for place in rules.origin.mounts_m or ()}
+    if mounts:
         place = np.array([one.place for one in placed])
-        kinds.append((place, np.ones(place.max() + 1, dtype=np.intp)))
+        most = np.full(place.max() + 1, count)
+        most[[one.place for one in placed if tuple(one.pose.origin_m.tolist()) in mounts]] = 1
+        kinds.append((place, most))
+    if constraints.each:
+        entry, others = np.array([one.entry for one in placed]), max(count - len(constraints.each), 0)
+        kinds.append((entry, np.array([*np.ones(len(constraints.each), dtype=np.intp), others])))
     budgets = []
     if budget.limit_mbps is not None:
         bits = [budget.model.mbps_of_widths(np.diff(one.shape.gate_m), min(one.part.rays, most_rays)) for one in placed]
@@ -381,22 +405,36 @@ def _limits(
 
 
 @phase("candidates")
-def proposed(parts: Sequence[Part], constraints: Constraints, samples: Samples, seed: int) -> list[PlacedPart]:
-    """Candidate parts at poses that the constraints allow.
+def proposed(
+    parts: Sequence[Part], constraints: Constraints, count: int, samples: Samples, seed: int
+) -> list[PlacedPart]:
+    """Candidate parts at poses that the constraints allow, for each entry of `each` and for the others.
 
     Raises:
         InfeasibleError: None keeps the constraints.
     """
-    rules, space = constraints.rules[0], samples.space
-    generator = random_generator(seed, "poses of parts")
-    places, axes = _places(rules, samples, generator), Axes.of(space)
-    kept = [ways for part in parts if (ways := shapes_of(part, space))]
-    if not kept:
+    space, generator = samples.space, random_generator(seed, "poses of parts")
+    ways = [ways for part in parts if (ways := shapes_of(part, space))]
+    if not ways:
         raise InfeasibleError(
             "no part measures within the range of the design space", conflicts=["space.range_m", "parts"]
         )
-    broken = [broken_keys(ways[0], rules) for ways in kept]
-    kept = [ways for ways, keys in zip(kept, broken, strict=True) if not keys]
+    numbers: dict[tuple[float, ...], int] = {}
+    every = constraints.rules if count > len(constraints.each) else constraints.rules[:-1]
+    return [one for rules in every for one in _proposed_for(rules, ways, samples, numbers, generator)]
+
+
+def _proposed_for(
+    rules: SensorRules,
+    ways: Sequence[Sequence[PartShape]],
+    samples: Samples,
+    numbers: dict[tuple[float, ...], int],
+    generator: np.random.Generator,
+) -> list[PlacedPart]:
+    """Candidates that keep the rules of one sensor; `numbers` are those of places."""
+    places, axes = _places(rules, samples, generator), Axes.of(samples.space)
+    broken = [broken_keys(shapes[0], rules) for shapes in ways]
+    kept = [shapes for shapes, keys in zip(ways, broken, strict=True) if not keys]
     if not kept or not len(places):
         keys = sorted(set().union(*broken)) if len(places) else ["origin"]
         raise InfeasibleError(
@@ -404,7 +442,7 @@ def proposed(parts: Sequence[Part], constraints: Constraints, samples: Samples, 
             conflicts=[*keys, "parts"],
             hint="loosen one of them, or name other parts",
         )
-    bounds = bounds_of(constraints.rules, space, (0,), interval_factor(DEFAULT_LEVEL))
+    bounds = bounds_of([rules], samples.space, (0,), interval_factor(DEFAULT_LEVEL))
     placed, points = [], observed_point(samples.resample(MOST_POSES, generator))
     for number, origin in enumerate(places):
         offset = points - origin
@@ -413,17 +451,31 @@ def proposed(parts: Sequence[Part], constraints: Constraints, samples: Samples, 
         azimuth, elevation = angles(looking / np.maximum(np.linalg.norm(looking, axis=1), TINY)[:, None])
         azimuth = clip_azimuth(azimuth, bounds)
         elevation = np.clip(elevation, bounds.elevation_low, bounds.elevation_high)
-        aims = list(zip(azimuth.tolist(), elevation.tolist(), strict=True))
-        for ways in kept:
-            for turn, shape in enumerate(ways):
+        # a fixed boresight leaves one of them
+        aims = list(dict.fromkeys(zip(azimuth.tolist(), elevation.tolist(), strict=True)))
+        place = numbers.setdefault(tuple(origin.tolist()), len(numbers))
+        for shapes in kept:
+            for turn, shape in enumerate(shapes):
+                roll = _roll_of(shape, rules)
                 # each way to mount a part has the middle, and its share of the others
-                for aim in (aims[0], *aims[1 + turn :: len(ways)]):
-                    pose = shape.pose(origin, *aim, np.clip(0.0, bounds.roll_low[0], bounds.roll_high[0]), axes)
+                for aim in (aims[0], *aims[1 + turn :: len(shapes)]) if roll is not None else ():
+                    pose = shape.pose(origin, *aim, roll, axes)
                     if _may_roll(part_sensor(shape.part, pose), rules):
-                        placed.append(PlacedPart(shape, pose, number))
+                        placed.append(PlacedPart(shape, pose, place, rules.index))
     if not placed:
-        raise InfeasibleError("no part can be mounted at the roll", conflicts=["boresight.roll_deg", "parts"])
+        raise InfeasibleError(
+            "no part can be mounted at the roll", conflicts=[rules.path("boresight.roll_deg"), "parts"]
+        )
     return placed
+
+
+def _roll_of(shape: PartShape, rules: SensorRules) -> float | None:
+    """The roll of a part nearest to upright, beside that of the way it is mounted [rad]; None where it may not turn."""
+    low, high = rules.boresight.roll_deg.min, rules.boresight.roll_deg.max
+    upright = 90.0 if shape.turned else 0.0
+    roll = float(np.clip(upright, -np.inf if low is None else low, np.inf if high is None else high))
+    # a part that is not upright is not turned as well
+    return None if shape.turned and roll != upright else np.radians(roll - upright)
 
 
 def _may_roll(sensor: Sensor, rules: SensorRules) -> bool:

@@ -135,11 +135,13 @@ class PlacedPart:
         shape: The part, upright or turned, and the gate of its rays.
         pose: Where it stands and looks.
         place: The number of the mount or origin at which it stands.
+        entry: The number of the entry of `each` that it keeps; beyond these, of the rules of all others.
     """
 
     shape: PartShape
     pose: Pose
     place: int
+    entry: int = 0
 
     @property
     def part(self) -> Part:

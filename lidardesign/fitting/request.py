@@ -332,7 +332,6 @@ def _with_parts(options: FitOptions, asked: Constraints | None, run: RunFolder) 
         and not options.numbers
         and asked.parts.count is None,
         "parts together with --at or --weight": options.at or options.weights,
-        "parts together with each, which bounds single sensors": asked.each,
         f"parts in the layout {options.layout}": options.layout,
         "parts with --gates: a part's gates are fixed": options.gates,
         f"the task {run.task.name} has no method informs": not informs_rays(run.task),

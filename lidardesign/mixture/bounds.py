@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from lidardesign.constraints.document import Gate, SensorRules, rules_of
+from lidardesign.constraints.document import MOST_ROLL_DEG, Gate, SensorRules, rules_of
 from lidardesign.constraints.feasibility import azimuth_interval
 from lidardesign.constraints.origins import PINNED_BOX_M, free_boxes, origin_box
 from lidardesign.errors import InfeasibleError
@@ -216,7 +216,8 @@ def _bounds_row(rules: SensorRules, space: DesignSpace, interval: float) -> dict
         highest = min(space.high[ELEVATION], highest if elevation.max is None else math.radians(elevation.max))
         lowest, highest = poles if (lowest, highest) == poles else inward(lowest, highest)
     roll = rules.boresight.roll_deg
-    limits = inward(-45.0 if roll.min is None else roll.min, 45.0 if roll.max is None else roll.max)
+    ends = (-MOST_ROLL_DEG if roll.min is None else roll.min, MOST_ROLL_DEG if roll.max is None else roll.max)
+    limits = inward(*np.clip(ends, -MOST_ROLL_DEG, MOST_ROLL_DEG).tolist())
     is_open = roll.min is None and roll.max is None
     rolls = (-LARGEST_ROLL_RAD, LARGEST_ROLL_RAD) if is_open else tuple(map(math.radians, limits))
     fields_deg = [

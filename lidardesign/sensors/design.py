@@ -18,7 +18,7 @@ from lidardesign.scenes.rays import DEFAULT_RATE_HZ, Rays, fire_times
 from lidardesign.sensors.adaptive import AdaptivePatterns
 from lidardesign.sensors.bandwidth import split_budget
 from lidardesign.sensors.pattern import TRAVELLED, Pattern, even_rays, even_subset, with_coordinates
-from lidardesign.sensors.sensor import DEFAULT_LEVEL, Sensor
+from lidardesign.sensors.sensor import DEFAULT_LEVEL, Sensor, boresight_of
 from lidardesign.space import DIMENSIONS
 
 # Chosen on training scenes, even in fields of view, rings of sensors that turn, and what real parts have.
@@ -167,6 +167,32 @@ class DesignSpec:
             allowed=f"at most {self.size}",
             hint="a design of more parts: lidardesign catalog show NAME --rays N --out FILE",
         )
+
+    def remounted(self, index: int, origin_m: np.ndarray, frame: np.ndarray) -> DesignSpec:
+        """The design with one sensor at another pose, to which its rays and their gates go with it.
+
+        Certificates are of other rays, and are left out.
+
+        Arguments:
+            index: The sensor.
+            origin_m: Its new place, shape (3,) [m].
+            frame: Its new axes, rows forward, horizontal, vertical, shape (3, 3).
+        """
+        old = self.sensors[index]
+        turn, after_m = frame.T @ old.frame, np.array(origin_m, dtype=np.float64)
+        covariance = old.origin_covariance_m2
+        azimuth, elevation, roll = boresight_of(frame)
+        new = replace(
+            old, origin_m=after_m, azimuth_rad=azimuth, elevation_rad=elevation, roll_rad=roll,
+            origin_covariance_m2=None if covariance is None else turn @ covariance @ turn.T,
+        )  # fmt: skip
+        patterns, adaptive = (
+            tuple(pattern.remounted(index, old.origin_m, after_m, turn) for pattern in every)
+            for every in (self.patterns, () if self.adaptive is None else self.adaptive.patterns)
+        )
+        sensors = (*self.sensors[:index], new, *self.sensors[index + 1 :])
+        follows = None if self.adaptive is None else replace(self.adaptive, patterns=adaptive)
+        return replace(self, sensors=sensors, patterns=patterns, adaptive=follows, certificates=())
 
     def at_condition(self, at: Mapping[str, float]) -> DesignSpec:
         """The design at one value of its conditions, with patterns of one knot.

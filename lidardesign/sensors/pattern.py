@@ -18,7 +18,7 @@ import numpy as np
 from lidardesign.errors import ConfigError
 from lidardesign.scenes.rays import DEFAULT_RATE_HZ, Rays, fire_times
 from lidardesign.sensors.sensor import Sensor, tangent_directions
-from lidardesign.space import DIMENSIONS
+from lidardesign.space import DIMENSIONS, angles, direction
 
 # Conditions that a sensor can travel along: where a ray starts, not where it looks.
 TRAVELLED = DIMENSIONS[:3]
@@ -142,6 +142,20 @@ class Pattern:
         origin_m, *rest = ((1 - share) * column[right - 1] + share * column[right] for column in columns)
         origin_m[:, DIMENSIONS.index(self.dimension)] = value
         return Rays.from_angles(origin_m, *rest, self.sensor)
+
+    def remounted(self, sensor: int, before_m: np.ndarray, after_m: np.ndarray, turn: np.ndarray) -> Pattern:
+        """The pattern with the rays of one sensor turned (3, 3) about its place, which goes from (3,) to (3,) [m]."""
+        own, places = self.sensor == sensor, len(self.azimuth_rad)
+        before, after = (np.tile(place, (places, 1)) for place in (before_m, after_m))
+        if self.dimension is not None:
+            # along a condition the sensor is at its knots
+            before[:, DIMENSIONS.index(self.dimension)] = after[:, DIMENSIONS.index(self.dimension)] = self.knots
+        origin_m, looking = self.origin_m.copy(), direction(self.azimuth_rad, self.elevation_rad)
+        origin_m[:, own] = (origin_m[:, own] - before[:, None]) @ turn.T + after[:, None]
+        azimuth, elevation = self.azimuth_rad.copy(), self.elevation_rad.copy()
+        found = angles((looking[:, own] @ turn.T).reshape(-1, 3))
+        azimuth[:, own], elevation[:, own] = (one.reshape(places, -1) for one in found)
+        return replace(self, origin_m=origin_m, azimuth_rad=np.unwrap(azimuth, axis=0), elevation_rad=elevation)
 
     def moved(self, values: Mapping[int, float]) -> Pattern:
         """The pattern with given coordinates of all origins, by axis [m]."""

@@ -303,7 +303,7 @@ ZONES = replace(load_detector("consumer-8x8"), bins=None)
 def test_a_part_tells_what_its_own_rays_would(run, detector):
     opened = open_run(run)
     parts = [find_part(name) for name in THREE]
-    placed = part_design.proposed(parts, part_design.Constraints(), load_samples(run), 0)
+    placed = part_design.proposed(parts, part_design.Constraints(), 2, load_samples(run), 0)
     scene = opened.task.scenes(opened.config.task, "train", 0)[0]
     bundle = PartBundle(placed, 64, 1, detector)
     coverage = part_table(parts_inform(bundle, [scene], every_return, 2, 0), len(placed))

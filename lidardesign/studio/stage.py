@@ -1,0 +1,262 @@
+"""The three-dimensional view of the page: a scene, the sensors in it, and what becomes of their rays."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import viser
+from scipy.spatial.transform import Rotation
+
+from lidardesign.clouds.seen import SeenScene
+from lidardesign.report.scene_figure import (
+    drawn_share,
+    frustum_lines,
+    origin_lines,
+    own_triangles,
+    round_steps,
+    scene_bounds,
+)
+from lidardesign.report.view import MARGIN, OUTCOMES, camera
+from lidardesign.scenes.casting import SceneCaster
+from lidardesign.scenes.rays import Outcome
+from lidardesign.scenes.scene import Body, Plane, Scene
+from lidardesign.sensors.sensor import DEFAULT_LEVEL, Sensor, boresight_of
+from lidardesign.space import direction
+from lidardesign.studio.choices import Pose
+
+MOST_LINES = 2000  # rays that are drawn of a design
+TARGET, OTHER, BLIND = (201, 184, 168), (160, 166, 174), (205, 60, 60)
+DENSITY, BOX, MOUNT = (123, 45, 139), (110, 118, 130), (40, 90, 160)
+# Of the design that is changed, of its sensor with the handle, and of the design beside it.
+SENSOR, CHOSEN, BESIDE = (40, 44, 52), (214, 94, 0), (0, 114, 178)
+COLOURS = {int(code): tuple(bytes.fromhex(colour[1:])) for code, _, colour, _, _ in OUTCOMES}
+COLOURS[int(Outcome.MISS)] = (214, 217, 222)  # they hide what is behind them least
+HANDLE = "/handle"
+ARRAYS = {"add_line_segments": ("points", "colors"), "add_point_cloud": ("points", "colors")}
+# In shares of the scene's extent.
+HANDLE_SIZE, SENSOR_SIZE, POINT_SIZE, AXES_SIZE, CAMERA_AWAY = 0.16, 0.012, 0.006, 0.1, 0.8
+LABEL_SCALE = 0.8
+FROM_AHEAD_RAD = 1.4
+
+
+class Stage:
+    """The view of a server; all its tabs show the same.
+
+    Arguments:
+        server: The server.
+        frame: The name of the frame of places and directions.
+        is_mounted: Whether it is that of a robot's body.
+        on_pick: Called with the name of a sensor or mount that is clicked.
+        on_drag: Called with the handle's pose, and True once it is let go.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        frame: str,
+        is_mounted: bool,
+        on_pick: Callable[[str], None],
+        on_drag: Callable[[Pose, bool], None],
+    ) -> None:
+        self.api, self._pick, self._drag = server.scene, on_pick, on_drag
+        self._server, self._frame, self._is_mounted = server, frame, is_mounted
+        self._bodies: list[tuple[Body, Any]] = []
+        self._scene: Scene | None = None
+        self.extent_m, self.bounds = 1.0, np.zeros((2, 3))
+        self.api.set_up_direction("+z")
+        self.api.configure_default_lights()
+        self._visible: dict[str, bool] = {}
+        self._nodes: dict[str, Any] = {}
+        self._markers: dict[str, dict[str, Any]] = {}
+
+    def show_scene(self, scene: Scene, frame: int, rays: Sequence[Any]) -> None:
+        """Draw a scene, once, and then only the poses of what moves in it."""
+        if scene is not self._scene:
+            self._draw_scene(scene, rays)
+        for body, handle in self._bodies:
+            pose = body.pose(frame)
+            handle.position, handle.wxyz = pose[:3, 3], _quaternion(pose[:3, :3])
+
+    def _draw_scene(self, scene: Scene, rays: Sequence[Any]) -> None:
+        is_first = self._scene is None
+        for _, handle in self._bodies:
+            handle.remove()
+        self._scene, self._bodies = scene, []
+        # floors and walls may be far larger than what is looked at
+        targets = tuple(body for body in scene.bodies if body.is_target)
+        self.bounds = scene_bounds(replace(scene, bodies=targets or scene.bodies), 0, list(rays))
+        self.extent_m = float(np.ptp(self.bounds, axis=0).max())
+        share, steps = drawn_share(scene), round_steps(scene)
+        for number, body in enumerate(scene.bodies):
+            vertices, faces = own_triangles(body, body.pose(), self.bounds, share, steps)
+            colour = TARGET if body.is_target else OTHER
+            # through a floor one looks from below
+            side = "front" if isinstance(body.shape, Plane) else "double"
+            handle = self.api.add_mesh_simple(
+                f"/scene/{number}", vertices, faces, color=colour, flat_shading=True, side=side, cast_shadow=False
+            )
+            self._bodies.append((body, handle))
+        if is_first:
+            self.api.add_frame(
+                "/frame", axes_length=AXES_SIZE * self.extent_m, axes_radius=0.02 * AXES_SIZE * self.extent_m
+            )
+            self.api.add_label("/frame/name", f"origin of {self._frame}", font_screen_scale=LABEL_SCALE)
+            directions = np.concatenate([np.zeros((0, 3)), *(one.direction for one in rays)])
+            first = camera(directions)
+            # a robot that carries its sensors hides them from behind
+            turn = first["turn"] - (FROM_AHEAD_RAD if self._is_mounted else 0.0)
+            away = direction(turn, first["height"])
+            middle = self.bounds.mean(axis=0)
+            self._server.initial_camera.look_at = middle
+            self._server.initial_camera.position = middle + CAMERA_AWAY * self.extent_m * away
+
+    def show_seen(
+        self, seen: SeenScene, number: int, name: str = "design", colour: tuple[int, ...] | None = None
+    ) -> None:
+        """Draw the rays of an entry of `SeenScene.returns` by what becomes of them, and their returns as points."""
+        one = seen.returns[number]
+        rays = one.rays
+        chosen = np.unique(np.linspace(0, len(rays) - 1, min(len(rays), MOST_LINES)).astype(int)) if len(rays) else []
+        hits = SceneCaster(seen.scene, one.frame).first_hit(rays.origin_m[chosen], rays.direction[chosen])
+        reach = np.minimum(np.minimum(hits.range_m, rays.gate_m[chosen, 1]), (1 + MARGIN) * self.extent_m)
+        length = np.where(one.returned[chosen], one.range_m[chosen], reach)
+        ends = np.stack(
+            [rays.origin_m[chosen], rays.origin_m[chosen] + length[:, None] * rays.direction[chosen]], axis=1
+        )
+        outcomes = one.outcome[chosen]
+        palette = np.array([colour or COLOURS.get(code, SENSOR) for code in range(max(COLOURS) + 1)], dtype=np.uint8)
+        self._node("add_line_segments", f"/{name}/rays", ends, np.repeat(palette[outcomes][:, None], 2, axis=1))
+        points = ends[outcomes == Outcome.RETURN, 1]
+        shade = np.tile(np.array(colour or COLOURS[int(Outcome.RETURN)], dtype=np.uint8), (len(points), 1))
+        self._node("add_point_cloud", f"/{name}/returns", points, shade, point_size=POINT_SIZE * self.extent_m)
+
+    def show_sensors(
+        self, sensors: Sequence[Sensor], chosen: str | None, name: str = "design", colour: tuple[int, ...] = SENSOR
+    ) -> None:
+        """Draw sensors with their fields of view and gates; the chosen one in another colour."""
+        lines = [(_segments(frustum_lines(one)), CHOSEN if one.name == chosen else colour) for one in sensors]
+        lines += [(_segments(origin_lines(one, DEFAULT_LEVEL)), colour) for one in sensors]
+        points = np.concatenate([line for line, _ in lines])
+        shades = np.concatenate([np.tile(np.array(shade, dtype=np.uint8), (len(line), 2, 1)) for line, shade in lines])
+        self._node("add_line_segments", f"/{name}/fields of view", points, shades, thickness=1.6)
+        if name == "design":
+            self._show_markers("sensors", {one.name: one.origin_m for one in sensors}, SENSOR)
+
+    def show_places(self, mounts_m: Sequence[Sequence[float]], boxes: Sequence[np.ndarray]) -> None:
+        """Draw mounts, and the boxes (2, 3) [m] that bound places."""
+        edges = [_box_edges(box) for box in boxes]
+        lines = np.concatenate([np.zeros((0, 2, 3)), *edges])
+        shades = np.tile(np.array(BOX, dtype=np.uint8), (len(lines), 2, 1))
+        self._node("add_line_segments", "/places/boxes", lines, shades, thickness=1.0)
+        self._show_markers("mounts", {f"mount {n}": np.array(place) for n, place in enumerate(mounts_m)}, MOUNT)
+
+    def show_density(self, points_m: np.ndarray) -> None:
+        """Draw the points that the learned density observes, (N, 3) [m]."""
+        shade = np.tile(np.array(DENSITY, dtype=np.uint8), (len(points_m), 1))
+        self._node("add_point_cloud", "/density", points_m, shade, point_size=0.5 * POINT_SIZE * self.extent_m)
+
+    def show_blind(self, vertices: np.ndarray, faces: np.ndarray) -> None:
+        """Draw the surface that no sensor sees."""
+        self.remove("/blind")
+        if len(faces):
+            self._node("add_mesh_simple", "/blind", vertices, faces, color=BLIND, side="double", opacity=0.85)
+
+    def show_handle(self, pose: Pose | None, *, turns: bool = True, free: Sequence[bool] = (True, True, True)) -> None:
+        """Put the handle on a pose, without rotations for a mount; None takes it away."""
+        self.remove(HANDLE)
+        if pose is None:
+            return
+        handle = self.api.add_transform_controls(
+            HANDLE, scale=HANDLE_SIZE * self.extent_m, disable_rotations=not turns, depth_test=False,
+            disable_axes=not any(free), disable_sliders=not any(free),
+            position=pose.place_m, wxyz=_quaternion(pose.frame.T),
+        )  # fmt: skip
+
+        @handle.on_update
+        async def _(event: viser.TransformControlsEvent) -> None:
+            if event.phase != "start":
+                self._drag(_pose_of(event.target), event.phase == "end")
+
+    def place_handle(self, pose: Pose) -> None:
+        """Move the handle to a pose."""
+        handle = self.api.get_handle_by_name(HANDLE)
+        if handle is not None:
+            handle.position, handle.wxyz = np.array(pose.place_m), _quaternion(pose.frame.T)
+
+    def set_visible(self, name: str, visible: bool) -> None:
+        """Show or hide a node and what is below it."""
+        self._visible[name] = visible
+        handle = self.api.get_handle_by_name(name)
+        if handle is not None:
+            handle.visible = visible
+
+    def remove(self, name: str) -> None:
+        """Take a node away, where it is there."""
+        for inside in [node for node in self._nodes if node == name or node.startswith(f"{name}/")]:
+            del self._nodes[inside]
+        if self.api.get_handle_by_name(name) is not None:
+            self.api.remove_by_name(name)
+
+    def _node(self, method: str, name: str, *arrays: np.ndarray, **options: Any) -> None:
+        """Add a node, or give the one of this name other arrays."""
+        handle = self._nodes.get(name)
+        if handle is None:
+            if method == "add_line_segments":
+                options = {"thickness": 1.2, "thickness_units": "screen", **options}
+            visible = self._visible.get(name, True)
+            self._nodes[name] = getattr(self.api, method)(name, *arrays, visible=visible, **options)
+            return
+        for key, array in zip(ARRAYS[method], arrays, strict=True):
+            setattr(handle, key, array)
+
+    def _show_markers(self, group: str, places: dict[str, np.ndarray], colour: tuple[int, ...]) -> None:
+        """Balls that choose a sensor or mount when they are clicked."""
+        if [*places] != [*self._markers.get(group, {})]:
+            for ball, _ in self._markers.pop(group, {}).values():
+                ball.remove()
+            self._markers[group] = {name: self._marker(f"/{group}/{name}", name, colour) for name in places}
+        # what stands at one place is named together
+        names: dict[tuple[float, ...], list[str]] = {}
+        for name, place in places.items():
+            names.setdefault(tuple(np.round(place, 3)), []).append(name)
+        for name, place in places.items():
+            ball, label = self._markers[group][name]
+            ball.position, here = place, names[tuple(np.round(place, 3))]
+            label.text, label.visible = ", ".join(here), name == here[0]
+
+    def _marker(self, path: str, name: str, colour: tuple[int, ...]) -> tuple[Any, Any]:
+        ball = self.api.add_icosphere(path, radius=SENSOR_SIZE * self.extent_m, color=colour)
+
+        @ball.on_click
+        async def _(event: Any) -> None:
+            self._pick(name)
+
+        return ball, self.api.add_label(f"{path}/name", name, font_screen_scale=LABEL_SCALE)
+
+
+def _quaternion(matrix: np.ndarray) -> np.ndarray:
+    """A rotation (3, 3) as viser has it: the scalar first."""
+    return np.roll(Rotation.from_matrix(matrix).as_quat(), 1)
+
+
+def _pose_of(handle: Any) -> Pose:
+    """The pose of the handle, whose x axis looks forward and whose y axis is horizontal."""
+    frame = Rotation.from_quat(np.roll(handle.wxyz, -1)).as_matrix().T
+    return Pose.of(handle.position, np.degrees(boresight_of(frame)).tolist())
+
+
+def _segments(lines_m: np.ndarray) -> np.ndarray:
+    """Polylines separated by rows of NaN (K, 3) as segments (N, 2, 3)."""
+    pairs = np.stack([lines_m[:-1], lines_m[1:]], axis=1) if len(lines_m) else np.zeros((0, 2, 3))
+    return pairs[np.isfinite(pairs).all(axis=(1, 2))]
+
+
+def _box_edges(box: np.ndarray) -> np.ndarray:
+    """The edges of a box (2, 3) as segments (12, 2, 3)."""
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+    ends = [(a, b) for a in corners for b in corners if (b - a).min() >= 0 and (b - a).sum() == 1]
+    places = np.where(np.array(ends, dtype=bool), box[1], box[0])
+    return np.asarray(places)
