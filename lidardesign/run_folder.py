@@ -6,11 +6,11 @@ import contextlib
 import json
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lidardesign.config import RunConfig, load_run_config
+from lidardesign.config import RunConfig, load_run_config, with_task_settings
 from lidardesign.errors import LidardesignError
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
@@ -71,6 +71,14 @@ class RunFolder:
         """Metric of the task's scores with the run's configuration."""
         with plugin_guard(self.task.name):
             return metric_of(self.task, self.config.task)
+
+    def with_settings(self, settings: Sequence[str]) -> Self:
+        """This run with other settings of the task, as KEY=VALUE; its space stays.
+
+        Raises:
+            ConfigError: A key that is none, or that cannot be changed.
+        """
+        return replace(self, config=with_task_settings(self.task, self.config, settings)) if settings else self
 
     def conditions(self, space: DesignSpace | None = None) -> list[dict[str, float]]:
         """Condition values that designs are evaluated at, in the run's design space or a part; see `conditions_of`.

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lidardesign.config import with_task_settings
 from lidardesign.run_folder import RunFolder, settings_texts
 
 if TYPE_CHECKING:
@@ -51,12 +50,10 @@ class TrainingScores:
     @cached_property
     def scenes(self) -> list[Scene]:
         """The scenes."""
-        from dataclasses import replace
-
         from lidardesign.rays.training import TrainingScenes
 
-        config = with_task_settings(self.run.task, self.run.config, self.settings) if self.settings else self.run.config
-        stream = TrainingScenes(replace(self.run, config=config), config.seed).scenes(PURPOSE)
+        run = self.run.with_settings(self.settings)
+        stream = TrainingScenes(run, run.config.seed).scenes(PURPOSE)
         return list(itertools.islice(stream, self.count))
 
     def values(self, design: Design) -> np.ndarray:

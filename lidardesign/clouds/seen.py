@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from lidardesign.config import with_task_settings
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.numerics import COARSE_SLACK, SLACK
 from lidardesign.report.scene_figure import own_triangles, scene_bounds
@@ -204,8 +203,8 @@ def seen_scenes(
         measuring: How it measures.
         settings: Keys of the task with values, for scenes other than the learned ones.
     """
-    config = with_task_settings(run.task, run.config, settings) if settings else run.config
-    run, planner = replace(run, config=config), measuring.planner()
+    run, planner = run.with_settings(settings), measuring.planner()
+    config = run.config
     seed = config.seed if measuring.seed is None else measuring.seed
     chosen = run.scenes("test", seed)[:scenes] if isinstance(scenes, int) else scenes
     request = EvaluationRequest(

@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from shlex import join
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
 
 import numpy as np
 from pydantic import BaseModel
 
 from lidardesign.api.design import Design
 from lidardesign.constraints.document import Constraints, SensorConstraints
-from lidardesign.constraints.slack import split_name
+from lidardesign.constraints.slack import room_of, split_name
 from lidardesign.errors import ConfigError
 from lidardesign.run.validation import parse_override
+from lidardesign.run_folder import ignore
 from lidardesign.sensors.sensor import Sensor, boresight_frame
 
 if TYPE_CHECKING:
@@ -26,32 +28,29 @@ if TYPE_CHECKING:
 
 # What handles are rounded to, so that constraints are numbers that people can read.
 PLACE_DIGITS, ANGLE_DIGITS = 4, 2
-EVERY = "all sensors"
-UNITS = {"_m": "m", "_deg": "deg", "_mbps": "Mbit/s", "_ps": "ps", "_hz": "Hz", "_w": "W"}
+EVERY, MOUNT = "all sensors", "mount "
+PATH = r"[/\\]|\.yaml"  # in what would be the path of a part file
+UNIT, UNITS = r"_(m|deg|mbps|ps|hz|w)\b", {"mbps": "Mbit/s", "hz": "Hz", "w": "W"}
 
 
 @dataclass(frozen=True)
-class Pose:
+class SensorPose:
     """The place of a sensor [m] and its azimuth, elevation and roll [degrees], rounded."""
 
-    place_m: tuple[float, float, float]
-    angles_deg: tuple[float, float, float]
+    place_m: tuple[float, ...]
+    angles_deg: tuple[float, ...]
 
     @classmethod
-    def of(cls, place_m: Sequence[float], angles_deg: Sequence[float]) -> Pose:
+    def of(cls, place_m: Sequence[float], angles_deg: Sequence[float] = (0.0, 0.0, 0.0)) -> SensorPose:
         """The rounded pose."""
-        place, angles = (
-            # adding zero takes the sign from a rounded -0
-            tuple(round(float(value), digits) + 0.0 for value in values)
-            for values, digits in ((place_m, PLACE_DIGITS), (angles_deg, ANGLE_DIGITS))
-        )
-        return cls(place, angles)
+        # adding zero takes the sign from a rounded -0
+        place = tuple(round(float(value), PLACE_DIGITS) + 0.0 for value in place_m)
+        return cls(place, tuple(round(float(value), ANGLE_DIGITS) + 0.0 for value in angles_deg))
 
     @classmethod
-    def of_sensor(cls, sensor: Sensor) -> Pose:
+    def of_sensor(cls, sensor: Sensor) -> SensorPose:
         """The pose of a sensor."""
-        angles = (sensor.azimuth_rad, sensor.elevation_rad, sensor.roll_rad)
-        return cls.of(sensor.origin_m, [math.degrees(angle) for angle in angles])
+        return cls.of(sensor.origin_m, np.degrees([sensor.azimuth_rad, sensor.elevation_rad, sensor.roll_rad]).tolist())
 
     @property
     def frame(self) -> np.ndarray:
@@ -86,28 +85,63 @@ class Choices:
     scene: int = 0
     frame: int = 0
 
+    @classmethod
+    def of(cls, run: Run, design: Design, shown: Choices | None = None) -> Choices:
+        """The choices with a design and its constraints, in the scene that is shown; a saved one is fitted again."""
+        base = None if design.path is None else design
+        constraints = Constraints.from_mapping(design.specification.constraints).as_document()
+        return replace(shown or cls(run, design, {}), design=design, constraints=constraints, base=base, state="saved")
+
+    @property
+    def headline(self) -> str:
+        """What the design is, in a line."""
+        state = "changed: press Fit" if self.state == "changed" else f"as {self.state}"
+        sensors = f"{len(self.sensors)} sensor{'s' * (len(self.sensors) != 1)}"
+        return f"**{self.design.name}** ({state}): {sensors}, {self.design.usual_count(ignore)} rays"
+
     @property
     def sensors(self) -> tuple[Sensor, ...]:
         """The sensors of the design."""
         return self.design.specification.sensors
 
     @property
+    def mounts_m(self) -> list[list[float]]:
+        """The places of `origin.mounts_m`."""
+        return list(self.constraints.get("origin", {}).get("mounts_m") or ())
+
+    @property
+    def poses(self) -> dict[str, SensorPose]:
+        """What a handle can be put on: sensors and mounts by name."""
+        mounts = {f"{MOUNT}{number}": SensorPose.of(place) for number, place in enumerate(self.mounts_m)}
+        return {sensor.name: SensorPose.of_sensor(sensor) for sensor in self.sensors} | mounts
+
+    @property
+    def count_key(self) -> str:
+        """The key of the number of sensors."""
+        return "parts.count" if "parts" in self.constraints else "sensors.count"
+
+    @property
     def key(self) -> tuple[Any, ...]:
         """A key that is equal where a fit gives the same."""
-        base = None if self.base is None else self.base.path
-        return json.dumps(self.constraints), base, self.detector, self.settings
+        return json.dumps(self.constraints), self.base and self.base.path, self.detector, self.settings
 
-    def fit_arguments(self, name: str) -> dict[str, Any]:
-        """What `run.fit`, or the base's `constrain`, takes for these choices."""
+    def boxes(self, space_m: np.ndarray) -> list[np.ndarray]:
+        """The boxes (2, 3) [m] that bound places: the run's, that of the constraints, and those that are excluded."""
+        origin = self.constraints.get("origin", {})
+        bounds = np.array([origin.get("low_m", space_m[0]), origin.get("high_m", space_m[1])])
+        return [space_m, bounds, *(np.array([box["low_m"], box["high_m"]]) for box in origin.get("exclude", ()))]
+
+    def fit(self, name: str, **reports: Any) -> Design:
+        """The design that these choices come to; `reports` are `progress` and `notes`."""
+        fit = self.run.fit if self.base is None else self.base.constrain
         detector = None if self.detector == "ideal" else self.detector
-        return {"constraints": self.constraints, "detector": detector, "settings": self.settings, "name": name}
+        return fit(constraints=self.constraints, detector=detector, settings=self.settings, name=name, **reports)
 
     def command(self, name: str) -> str:
         """The command line that fits the same design."""
         words = ["lidardesign", "constrain", str(self.run.folder if self.base is None else self.base.path)]
-        for key, value in _shallow(self.constraints):
-            words += ["--set", f"{key}={_text(value)}"]
-        for setting in self.settings:
+        bounds = [f"{key}={_text(value)}" for key, value in _sections(self.constraints)]
+        for setting in (*bounds, *self.settings):
             words += ["--set", setting]
         return join([*words, *(() if self.detector == "ideal" else ("--detector", self.detector)), "--name", name])
 
@@ -120,67 +154,68 @@ class Choices:
             scope: `EVERY`, or the name of a sensor.
 
         Raises:
-            ConfigError: A value that the key does not take.
+            ConfigError: A value that the key does not take, or a path: the page opens no files.
         """
         document: dict[str, Any] = deepcopy(dict(self.constraints))
-        target = document if scope == EVERY else _entry(document, self._number(scope), len(self.sensors))
-        value = parse_override(f"{key}={text}").value if text.strip() else None
-        _set(target, key.split("."), value)
+        is_own = scope != EVERY and key.split(".")[0] in SensorConstraints.model_fields
+        target = _entry(document, self._number(scope)) if is_own else document
+        _set(target, key.split("."), parse_override(f"{key}={text}").value if text.strip() else None)
+        if key == self.count_key and text.strip():
+            document["each"] = document.get("each", [])[: int(text)]
         return self._with(document)
 
-    def moved(self, sensor: int, pose: Pose) -> Choices:
-        """The choices with a sensor at another pose; what has changed of it is fixed from then on."""
-        own, document = self.sensors[sensor], deepcopy(dict(self.constraints))
-        before = Pose.of_sensor(own)
+    def made_of(self, part: str | None) -> Choices:
+        """The choices with as many sensors of a part of the catalogue; None: of any shape."""
+        document = {key: value for key, value in self.constraints.items() if key not in ("parts", "sensors", "budget")}
+        if part is not None:
+            document["parts"] = {"names": [part], "count": len(self.sensors)}
+        return self._with(document)
+
+    def moved(self, name: str, pose: SensorPose) -> Choices:
+        """The choices with a sensor or mount at another pose; what has changed of a sensor is fixed from then on."""
+        document: dict[str, Any] = deepcopy(dict(self.constraints))
+        if name.startswith(MOUNT):
+            document["origin"]["mounts_m"][int(name.removeprefix(MOUNT))] = list(pose.place_m)
+            return self._with(document)
+        number, before = self._number(name), self.poses[name]
+        own, is_placed = self.sensors[number], pose.place_m != before.place_m
+        is_turned = pose.angles_deg != before.angles_deg
         # what has not changed is not rounded either
-        place = own.origin_m if pose.place_m == before.place_m else pose.place_m
-        frame = own.frame if pose.angles_deg == before.angles_deg else pose.frame
-        design = self.design.remounted(sensor, place, frame)
-        count = "parts" if "parts" in document else "sensors"
-        _set(document, [count, "count"], len(self.sensors))
-        entry = _entry(document, sensor, len(self.sensors))
-        mounts = document.get("origin", {}).get("mounts_m")
-        if pose.place_m != before.place_m and mounts:
+        place, frame = pose.place_m if is_placed else own.origin_m, pose.frame if is_turned else own.frame
+        _set(document, self.count_key.split("."), len(self.sensors))
+        entry = _entry(document, number)
+        if is_placed and self.mounts_m:
             # its mount goes with it
-            distances = [math.dist(mount, before.place_m) for mount in mounts]
-            mounts[int(np.argmin(distances))] = list(pose.place_m)
-        elif pose.place_m != before.place_m:
-            _set(entry, ["origin"], {"fixed_m": list(pose.place_m)})
-        if pose.angles_deg != before.angles_deg:
+            distances = [math.dist(mount, before.place_m) for mount in self.mounts_m]
+            document["origin"]["mounts_m"][int(np.argmin(distances))] = list(pose.place_m)
+        elif is_placed:
+            entry["origin"] = {"fixed_m": list(pose.place_m)}
+        if is_turned:
             azimuth, elevation, roll = pose.angles_deg
             # a fitted field is the same after a quarter turn, with its two angles exchanged
             roll = roll if "parts" in document else round((roll + 45.0) % 90.0 - 45.0, ANGLE_DIGITS)
             named = {"azimuth_deg": azimuth, "elevation_deg": elevation, "roll_deg": roll}
-            _set(entry, ["boresight"], {name: {"min": value, "max": value} for name, value in named.items()})
-        return replace(self._with(document), design=design)
+            entry["boresight"] = {key: {"min": value, "max": value} for key, value in named.items()}
+        return replace(self._with(document), design=self.design.remounted(number, place, frame))
 
-    def freed(self, sensor: int) -> Choices:
+    def fixed(self, name: str) -> list[str]:
+        """What is fixed of a sensor, in words."""
+        each = self.constraints.get("each") or []
+        entry = each[self._number(name)] if self._number(name) < len(each) else {}
+        return [word for word, key in (("place", "origin"), ("boresight", "boresight")) if key in entry]
+
+    def freed(self, name: str) -> Choices:
         """The choices with the place and boresight of a sensor open again."""
         document: dict[str, Any] = deepcopy(dict(self.constraints))
-        entry = _entry(document, sensor, len(self.sensors))
+        entry = _entry(document, self._number(name))
         for key in ("origin.fixed_m", "boresight"):
             _set(entry, key.split("."), None)
-        if not any(document["each"]):
-            del document["each"]
         return self._with(document)
-
-    def mount_moved(self, mount: int, place_m: Sequence[float]) -> Choices:
-        """The choices with a mount at another place."""
-        document: dict[str, Any] = deepcopy(dict(self.constraints))
-        document["origin"]["mounts_m"][mount] = list(Pose.of(place_m, ()).place_m)
-        return self._with(document)
-
-    @property
-    def mounts_m(self) -> list[list[float]]:
-        """The places of `origin.mounts_m`."""
-        return list(self.constraints.get("origin", {}).get("mounts_m") or ())
 
     def value(self, key: str, scope: str = EVERY) -> str:
         """The value of a key as text; empty where it has none."""
-        node: Any = self.constraints
-        if scope != EVERY:
-            entries, number = self.constraints.get("each") or [], self._number(scope)
-            node = entries[number] if number < len(entries) else {}
+        each: Any = self.constraints.get("each") or []
+        node = self.constraints if scope == EVERY else dict(enumerate(each)).get(self._number(scope))
         for part in key.split("."):
             node = node.get(part) if isinstance(node, Mapping) else None
         return "" if node is None else _text(node)
@@ -188,17 +223,20 @@ class Choices:
     def tight(self, scope: str = EVERY) -> set[str]:
         """The keys whose bounds limit the design, or one sensor of it."""
         checks = () if self.design.result is None else self.design.result.constraints
-        from lidardesign.constraints.slack import room_of
-
-        names = [sensor.name for sensor in self.sensors]
-        owned = [(*split_name(check.name, names), check) for check in checks]
+        owned = [(*split_name(check.name, [*self.poses]), check) for check in checks]
         return {key for owner, key, check in owned if room_of(check).is_tight and scope in (EVERY, owner)}
 
-    def _number(self, scope: str) -> int:
-        return [sensor.name for sensor in self.sensors].index(scope)
+    def _number(self, name: str) -> int:
+        return [sensor.name for sensor in self.sensors].index(name)
 
-    def _with(self, document: Mapping[str, Any]) -> Choices:
+    def _with(self, document: dict[str, Any]) -> Choices:
         """The choices with a constraint file, checked."""
+        if not any(document.get("each", ())):
+            document.pop("each", None)
+        names = document.get("parts", {}).get("names", ())
+        paths = [name for name in names if re.search(PATH, str(name))]
+        if paths:
+            raise ConfigError(f"{paths[0]!r} is a path", where="parts.names", allowed="names of parts in the catalogue")
         checked = Constraints.from_mapping(document).as_document()
         return replace(self, constraints=checked, state="changed")
 
@@ -206,32 +244,29 @@ class Choices:
 def constraint_keys(model: type[BaseModel] = Constraints, prefix: str = "") -> Iterator[str]:
     """The keys of a constraint file, without `each`."""
     for name, field in model.model_fields.items():
-        inside = [kind for kind in (field.annotation, *get_args(field.annotation)) if isinstance(kind, type)]
-        deeper = next((kind for kind in inside if issubclass(kind, BaseModel)), None)
-        if deeper is not None and "list" not in str(field.annotation) and "dict" not in str(field.annotation):
-            yield from constraint_keys(deeper, f"{prefix}{name}.")
-        elif prefix or name != "each":
+        kinds = [kind for kind in (field.annotation, *get_args(field.annotation)) if isinstance(kind, type)]
+        deeper = next((kind for kind in kinds if issubclass(kind, BaseModel)), None)
+        if f"{prefix}{name}" == "each":
+            continue
+        if deeper is None or get_origin(field.annotation) in (list, dict):
             yield prefix + name
-
-
-def is_per_sensor(key: str) -> bool:
-    """True for keys that may stand under `each`."""
-    return key.split(".")[0] in SensorConstraints.model_fields
+        else:
+            yield from constraint_keys(deeper, f"{prefix}{name}.")
 
 
 def key_label(key: str) -> str:
     """A key without its section, in words, as `width max [m]`."""
-    words = key.split(".")[1:] or [key]
-    unit = next((unit for word in words for end, unit in UNITS.items() if word.endswith(end)), None)
-    plain = " ".join(next((word.removesuffix(end) for end in UNITS if word.endswith(end)), word) for word in words)
-    return plain.replace("_", " ") + (f" [{unit}]" if unit else "")
+    inside = key.split(".", 1)[-1]
+    unit = re.search(UNIT, inside)
+    words = re.sub(UNIT, "", inside).replace(".", " ").replace("_", " ")
+    return words if unit is None else f"{words} [{UNITS.get(unit[1], unit[1])}]"
 
 
-def _shallow(document: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Every key of a constraint file with its value; lists and mappings by name are values."""
+def _sections(document: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Every key of a constraint file with its value; lists, and numbers of parts by their names, are values."""
     for key, value in document.items():
         if isinstance(value, Mapping) and f"{prefix}{key}" != "parts.each":
-            yield from _shallow(value, f"{prefix}{key}.")
+            yield from _sections(value, f"{prefix}{key}.")
         else:
             yield prefix + key, value
 
@@ -244,21 +279,17 @@ def _text(value: Any) -> str:
 def _set(node: dict[str, Any], path: Sequence[str], value: Any) -> None:
     """Set a value in place, or take it away with the mappings that it leaves empty."""
     first, *rest = path
-    if rest:
-        inner = node.setdefault(first, {})
-        if not isinstance(inner, dict):
-            raise ConfigError(f"{first} holds {inner!r}", where=".".join(path))
+    inner = node.setdefault(first, {}) if rest else value
+    if rest and isinstance(inner, dict):
         _set(inner, rest, value)
-        if not inner:
-            del node[first]
-    elif value is None:
+    if inner in (None, {}):
         node.pop(first, None)
-    else:
+    elif not rest:
         node[first] = value
 
 
-def _entry(document: dict[str, Any], number: int, count: int) -> dict[str, Any]:
+def _entry(document: dict[str, Any], number: int) -> dict[str, Any]:
     """The entry of `each` of a sensor, made where it is missing."""
     each = document.setdefault("each", [])
-    each += [{} for _ in range(min(number + 1, count) - len(each))]
+    each += [{} for _ in range(number + 1 - len(each))]
     return each[number]

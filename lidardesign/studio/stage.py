@@ -10,7 +10,6 @@ import numpy as np
 import viser
 from scipy.spatial.transform import Rotation
 
-from lidardesign.clouds.seen import SeenScene
 from lidardesign.report.scene_figure import (
     drawn_share,
     frustum_lines,
@@ -21,24 +20,25 @@ from lidardesign.report.scene_figure import (
 )
 from lidardesign.report.view import MARGIN, OUTCOMES, camera
 from lidardesign.scenes.casting import SceneCaster
-from lidardesign.scenes.rays import Outcome
+from lidardesign.scenes.rays import Outcome, Rays, Returns
 from lidardesign.scenes.scene import Body, Plane, Scene
+from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.sensor import DEFAULT_LEVEL, Sensor, boresight_of
 from lidardesign.space import direction
-from lidardesign.studio.choices import Pose
+from lidardesign.studio.choices import MOUNT, SensorPose
 
 MOST_LINES = 2000  # rays that are drawn of a design
 TARGET, OTHER, BLIND = (201, 184, 168), (160, 166, 174), (205, 60, 60)
-DENSITY, BOX, MOUNT = (123, 45, 139), (110, 118, 130), (40, 90, 160)
+DENSITY, BOX, PLACE = (123, 45, 139), (110, 118, 130), (40, 90, 160)
 # Of the design that is changed, of its sensor with the handle, and of the design beside it.
 SENSOR, CHOSEN, BESIDE = (40, 44, 52), (214, 94, 0), (0, 114, 178)
 COLOURS = {int(code): tuple(bytes.fromhex(colour[1:])) for code, _, colour, _, _ in OUTCOMES}
 COLOURS[int(Outcome.MISS)] = (214, 217, 222)  # they hide what is behind them least
 HANDLE = "/handle"
-ARRAYS = {"add_line_segments": ("points", "colors"), "add_point_cloud": ("points", "colors")}
+Colour = tuple[int, int, int]
 # In shares of the scene's extent.
-HANDLE_SIZE, SENSOR_SIZE, POINT_SIZE, AXES_SIZE, CAMERA_AWAY = 0.16, 0.012, 0.006, 0.1, 0.8
-LABEL_SCALE = 0.8
+DENSITY_SIZE, HANDLE_SIZE, SENSOR_SIZE, POINT_SIZE, AXES_SIZE, CAMERA_AWAY = 0.003, 0.16, 0.012, 0.006, 0.1, 0.8
+LABEL_SCALE, LINE_PX = 0.8, 1.3
 FROM_AHEAD_RAD = 1.4
 
 
@@ -47,8 +47,7 @@ class Stage:
 
     Arguments:
         server: The server.
-        frame: The name of the frame of places and directions.
-        is_mounted: Whether it is that of a robot's body.
+        design: A design in the frame that is drawn.
         on_pick: Called with the name of a sensor or mount that is clicked.
         on_drag: Called with the handle's pose, and True once it is let go.
     """
@@ -56,13 +55,12 @@ class Stage:
     def __init__(
         self,
         server: viser.ViserServer,
-        frame: str,
-        is_mounted: bool,
+        design: DesignSpec,
         on_pick: Callable[[str], None],
-        on_drag: Callable[[Pose, bool], None],
+        on_drag: Callable[[SensorPose, bool], None],
     ) -> None:
         self.api, self._pick, self._drag = server.scene, on_pick, on_drag
-        self._server, self._frame, self._is_mounted = server, frame, is_mounted
+        self._server, self._frame, self._is_mounted = server, design.frame, design.mount is not None
         self._bodies: list[tuple[Body, Any]] = []
         self._scene: Scene | None = None
         self.extent_m, self.bounds = 1.0, np.zeros((2, 3))
@@ -72,7 +70,7 @@ class Stage:
         self._nodes: dict[str, Any] = {}
         self._markers: dict[str, dict[str, Any]] = {}
 
-    def show_scene(self, scene: Scene, frame: int, rays: Sequence[Any]) -> None:
+    def show_scene(self, scene: Scene, frame: int, rays: Sequence[Rays]) -> None:
         """Draw a scene, once, and then only the poses of what moves in it."""
         if scene is not self._scene:
             self._draw_scene(scene, rays)
@@ -80,7 +78,7 @@ class Stage:
             pose = body.pose(frame)
             handle.position, handle.wxyz = pose[:3, 3], _quaternion(pose[:3, :3])
 
-    def _draw_scene(self, scene: Scene, rays: Sequence[Any]) -> None:
+    def _draw_scene(self, scene: Scene, rays: Sequence[Rays]) -> None:
         is_first = self._scene is None
         for _, handle in self._bodies:
             handle.remove()
@@ -113,65 +111,54 @@ class Stage:
             self._server.initial_camera.look_at = middle
             self._server.initial_camera.position = middle + CAMERA_AWAY * self.extent_m * away
 
-    def show_seen(
-        self, seen: SeenScene, number: int, name: str = "design", colour: tuple[int, ...] | None = None
-    ) -> None:
-        """Draw the rays of an entry of `SeenScene.returns` by what becomes of them, and their returns as points."""
-        one = seen.returns[number]
-        rays = one.rays
-        chosen = np.unique(np.linspace(0, len(rays) - 1, min(len(rays), MOST_LINES)).astype(int)) if len(rays) else []
-        hits = SceneCaster(seen.scene, one.frame).first_hit(rays.origin_m[chosen], rays.direction[chosen])
-        reach = np.minimum(np.minimum(hits.range_m, rays.gate_m[chosen, 1]), (1 + MARGIN) * self.extent_m)
-        length = np.where(one.returned[chosen], one.range_m[chosen], reach)
-        ends = np.stack(
-            [rays.origin_m[chosen], rays.origin_m[chosen] + length[:, None] * rays.direction[chosen]], axis=1
-        )
-        outcomes = one.outcome[chosen]
-        palette = np.array([colour or COLOURS.get(code, SENSOR) for code in range(max(COLOURS) + 1)], dtype=np.uint8)
-        self._node("add_line_segments", f"/{name}/rays", ends, np.repeat(palette[outcomes][:, None], 2, axis=1))
-        points = ends[outcomes == Outcome.RETURN, 1]
-        shade = np.tile(np.array(colour or COLOURS[int(Outcome.RETURN)], dtype=np.uint8), (len(points), 1))
-        self._node("add_point_cloud", f"/{name}/returns", points, shade, point_size=POINT_SIZE * self.extent_m)
+    def show_seen(self, scene: Scene, returns: Returns, beside: Colour | None = None) -> None:
+        """Draw rays by what becomes of them, and their returns as points; those of a design beside it in one colour."""
+        rays, name = returns.rays, "/design" if beside is None else "/beside"
+        hits = SceneCaster(scene, returns.frame).first_hit(rays.origin_m, rays.direction)
+        reach = np.minimum(np.minimum(hits.range_m, rays.gate_m[:, 1]), (1 + MARGIN) * self.extent_m)
+        length = np.where(returns.returned, returns.range_m, reach)
+        ends = np.stack([rays.origin_m, rays.origin_m + length[:, None] * rays.direction], axis=1)
+        palette = np.array([beside or COLOURS.get(code, SENSOR) for code in range(max(COLOURS) + 1)], dtype=np.uint8)
+        shades = palette[returns.outcome]
+        drawn = np.unique(np.linspace(0, max(len(rays) - 1, 0), MOST_LINES).astype(int))[: len(rays)]
+        self._lines(f"{name}/rays", ends[drawn], shades[drawn])
+        self._points(f"{name}/returns", ends[returns.returned, 1], shades[returns.returned], POINT_SIZE)
 
-    def show_sensors(
-        self, sensors: Sequence[Sensor], chosen: str | None, name: str = "design", colour: tuple[int, ...] = SENSOR
-    ) -> None:
+    def show_sensors(self, sensors: Sequence[Sensor], chosen: str | None, beside: Colour | None = None) -> None:
         """Draw sensors with their fields of view and gates; the chosen one in another colour."""
-        lines = [(_segments(frustum_lines(one)), CHOSEN if one.name == chosen else colour) for one in sensors]
-        lines += [(_segments(origin_lines(one, DEFAULT_LEVEL)), colour) for one in sensors]
-        points = np.concatenate([line for line, _ in lines])
-        shades = np.concatenate([np.tile(np.array(shade, dtype=np.uint8), (len(line), 2, 1)) for line, shade in lines])
-        self._node("add_line_segments", f"/{name}/fields of view", points, shades, thickness=1.6)
-        if name == "design":
+        pieces = [(_segments(frustum_lines(one)), one) for one in sensors]
+        pieces += [(_segments(origin_lines(one, DEFAULT_LEVEL)), one) for one in sensors]
+        shades = [np.tile(CHOSEN if one.name == chosen else beside or SENSOR, (len(lines), 1)) for lines, one in pieces]
+        name = "/design" if beside is None else "/beside"
+        self._lines(f"{name}/fields of view", np.concatenate([lines for lines, _ in pieces]), np.concatenate(shades))
+        if beside is None:
             self._show_markers("sensors", {one.name: one.origin_m for one in sensors}, SENSOR)
 
     def show_places(self, mounts_m: Sequence[Sequence[float]], boxes: Sequence[np.ndarray]) -> None:
         """Draw mounts, and the boxes (2, 3) [m] that bound places."""
-        edges = [_box_edges(box) for box in boxes]
-        lines = np.concatenate([np.zeros((0, 2, 3)), *edges])
-        shades = np.tile(np.array(BOX, dtype=np.uint8), (len(lines), 2, 1))
-        self._node("add_line_segments", "/places/boxes", lines, shades, thickness=1.0)
-        self._show_markers("mounts", {f"mount {n}": np.array(place) for n, place in enumerate(mounts_m)}, MOUNT)
+        lines = np.concatenate([_box_edges(box) for box in boxes])
+        self._lines("/places/boxes", lines, np.tile(BOX, (len(lines), 1)))
+        places = {f"{MOUNT}{number}": np.array(place) for number, place in enumerate(mounts_m)}
+        self._show_markers("mounts", places, PLACE)
 
     def show_density(self, points_m: np.ndarray) -> None:
         """Draw the points that the learned density observes, (N, 3) [m]."""
-        shade = np.tile(np.array(DENSITY, dtype=np.uint8), (len(points_m), 1))
-        self._node("add_point_cloud", "/density", points_m, shade, point_size=0.5 * POINT_SIZE * self.extent_m)
+        self._points("/density", points_m, np.tile(DENSITY, (len(points_m), 1)), DENSITY_SIZE)
 
     def show_blind(self, vertices: np.ndarray, faces: np.ndarray) -> None:
         """Draw the surface that no sensor sees."""
         self.remove("/blind")
         if len(faces):
-            self._node("add_mesh_simple", "/blind", vertices, faces, color=BLIND, side="double", opacity=0.85)
+            self.api.add_mesh_simple("/blind", vertices, faces, color=BLIND, side="double", opacity=0.85)
 
-    def show_handle(self, pose: Pose | None, *, turns: bool = True, free: Sequence[bool] = (True, True, True)) -> None:
+    def show_handle(self, pose: SensorPose | None, *, turns: bool = True, moves: bool = True) -> None:
         """Put the handle on a pose, without rotations for a mount; None takes it away."""
         self.remove(HANDLE)
         if pose is None:
             return
         handle = self.api.add_transform_controls(
             HANDLE, scale=HANDLE_SIZE * self.extent_m, disable_rotations=not turns, depth_test=False,
-            disable_axes=not any(free), disable_sliders=not any(free),
+            disable_axes=not moves, disable_sliders=not moves,
             position=pose.place_m, wxyz=_quaternion(pose.frame.T),
         )  # fmt: skip
 
@@ -179,12 +166,6 @@ class Stage:
         async def _(event: viser.TransformControlsEvent) -> None:
             if event.phase != "start":
                 self._drag(_pose_of(event.target), event.phase == "end")
-
-    def place_handle(self, pose: Pose) -> None:
-        """Move the handle to a pose."""
-        handle = self.api.get_handle_by_name(HANDLE)
-        if handle is not None:
-            handle.position, handle.wxyz = np.array(pose.place_m), _quaternion(pose.frame.T)
 
     def set_visible(self, name: str, visible: bool) -> None:
         """Show or hide a node and what is below it."""
@@ -200,17 +181,25 @@ class Stage:
         if self.api.get_handle_by_name(name) is not None:
             self.api.remove_by_name(name)
 
-    def _node(self, method: str, name: str, *arrays: np.ndarray, **options: Any) -> None:
-        """Add a node, or give the one of this name other arrays."""
+    def _lines(self, name: str, ends_m: np.ndarray, shades: np.ndarray) -> None:
+        """Draw segments (N, 2, 3) [m] in colours (N, 3), or move those of this name."""
+        colours = np.repeat(shades[:, None], 2, axis=1).astype(np.uint8)
+        options = {"thickness": LINE_PX, "thickness_units": "screen"}
+        self._node(name, self.api.add_line_segments, ends_m, colours, options)
+
+    def _points(self, name: str, points_m: np.ndarray, shades: np.ndarray, size: float) -> None:
+        """Draw points (N, 3) [m] in colours (N, 3), or move those of this name."""
+        options = {"point_size": size * self.extent_m}
+        self._node(name, self.api.add_point_cloud, points_m.astype(np.float32), shades.astype(np.uint8), options)
+
+    def _node(
+        self, name: str, add: Callable[..., Any], points: np.ndarray, colors: np.ndarray, options: dict[str, Any]
+    ) -> None:
         handle = self._nodes.get(name)
         if handle is None:
-            if method == "add_line_segments":
-                options = {"thickness": 1.2, "thickness_units": "screen", **options}
-            visible = self._visible.get(name, True)
-            self._nodes[name] = getattr(self.api, method)(name, *arrays, visible=visible, **options)
-            return
-        for key, array in zip(ARRAYS[method], arrays, strict=True):
-            setattr(handle, key, array)
+            self._nodes[name] = add(name, points, colors, visible=self._visible.get(name, True), **options)
+        else:
+            handle.points, handle.colors = points, colors
 
     def _show_markers(self, group: str, places: dict[str, np.ndarray], colour: tuple[int, ...]) -> None:
         """Balls that choose a sensor or mount when they are clicked."""
@@ -242,10 +231,10 @@ def _quaternion(matrix: np.ndarray) -> np.ndarray:
     return np.roll(Rotation.from_matrix(matrix).as_quat(), 1)
 
 
-def _pose_of(handle: Any) -> Pose:
+def _pose_of(handle: Any) -> SensorPose:
     """The pose of the handle, whose x axis looks forward and whose y axis is horizontal."""
     frame = Rotation.from_quat(np.roll(handle.wxyz, -1)).as_matrix().T
-    return Pose.of(handle.position, np.degrees(boresight_of(frame)).tolist())
+    return SensorPose.of(handle.position, np.degrees(boresight_of(frame)).tolist())
 
 
 def _segments(lines_m: np.ndarray) -> np.ndarray:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from html import escape
+from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,7 +16,6 @@ import numpy as np
 from lidardesign.api.design import Design
 from lidardesign.api.run import FIXED_BASELINES
 from lidardesign.api.training_scores import TrainingScores
-from lidardesign.constraints.document import Constraints
 from lidardesign.errors import ConfigError, LidardesignError
 from lidardesign.estimates import Interval, figure_and_interval
 from lidardesign.fitting.options import FitOptions
@@ -31,8 +31,8 @@ from lidardesign.samples import load_samples
 from lidardesign.sensors.adaptive import mean_mbps
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.space import observed_point
-from lidardesign.studio.choices import EVERY, Choices, Pose
-from lidardesign.studio.panel import ANY, DETECTORS, LAYERS, LIGHTS, NONE, SPLITS, STEPS, Panel
+from lidardesign.studio.choices import EVERY, MOUNT, Choices, SensorPose
+from lidardesign.studio.panel import LAYERS, LIGHTS, NONE, SPLITS, STEPS, ControlPanel
 from lidardesign.studio.server import start_server, stop_server
 from lidardesign.studio.stage import BESIDE, COLOURS, Stage
 from lidardesign.task import random_generator
@@ -48,8 +48,9 @@ DENSITY_POINTS = 3000
 MOST_UNDONE = 100
 NAME = "studio"  # of designs that are not saved yet
 CONSTRAINTS = "constraints"  # the folder of constraint files in a run
-SLIDERS = ("sensors", "rays")
 END_S = 1.0  # for which what is under way is waited for
+# What sliders change, which pass many values on their way.
+SLID = (("limit", "budget.rays"), ("count", ""))
 
 
 class StoppedError(Exception):
@@ -65,41 +66,34 @@ class Worker:
     """
 
     def __init__(self, name: str, failed: Callable[[Exception], None]) -> None:
-        self._waiting: dict[str, Callable[[], None]] = {}
-        self._news, self._failed, self._ends = threading.Condition(), failed, False
+        self._queue: SimpleQueue[Any] = SimpleQueue()
+        self._last: dict[Any, Callable[[], None]] = {}
+        self._failed = failed
         self._thread = threading.Thread(target=self._work, name=name, daemon=True)
         self._thread.start()
 
-    def ask(self, name: str, work: Callable[[], None]) -> None:
+    def ask(self, name: Any, work: Callable[[], None]) -> None:
         """Have something done after what was asked for under other names."""
-        with self._news:
-            self._waiting.pop(name, None)
-            self._waiting[name] = work
-            self._news.notify()
+        self._last[name] = work
+        self._queue.put((name, work))
 
     def drop(self) -> None:
         """Forget what waits."""
-        with self._news:
-            self._waiting.clear()
+        self._last.clear()
 
     def stop(self) -> None:
         """End the thread after what it does now, which is not waited for long."""
-        with self._news:
-            self._ends = True
-            self._news.notify()
+        self.drop()
+        self._queue.put(None)
         self._thread.join(END_S)
 
     def _work(self) -> None:
-        while True:
-            with self._news:
-                self._news.wait_for(lambda: self._waiting or self._ends)
-                if self._ends:
-                    return
-                work = self._waiting.pop(next(iter(self._waiting)))
-            try:
-                work()
-            except Exception as error:
-                self._failed(error)
+        for name, work in iter(self._queue.get, None):
+            if self._last.get(name) is work:
+                try:
+                    work()
+                except Exception as error:
+                    self._failed(error)
 
 
 class Studio:
@@ -112,42 +106,26 @@ class Studio:
 
     Raises:
         ConfigError: The port is taken.
-
-    Example:
-        >>> studio = Studio(run)  # doctest: +SKIP
-        >>> studio.address  # doctest: +SKIP
-        'http://127.0.0.1:41233/YyC4...'
-        >>> studio.stop()  # doctest: +SKIP
     """
 
     def __init__(self, run: Run, design: Design | None = None, port: int | None = None) -> None:
         self.run, self.saved = run, {one.name: one for one in run.designs()}
-        first = design or next(reversed(self.saved.values()), None) or run.fit(name=NAME)
-        self.choices = _loaded(run, first)
+        self.choices = Choices.of(run, design or next(reversed(self.saved.values()), None) or run.fit(name=NAME))
         self._ends_m = np.array([run.config.space.low[:3], run.config.space.high[:3]])  # of places of sensors
         self._before: list[Choices] = []
         self._after: list[Choices] = []
-        self._beside: Design | None = None
-        self._handle, self._scope, self._reference, self._last = NONE, EVERY, first, ""
-        self._blind_is_shown, self._stops = False, threading.Event()
+        self._handle, self._scope, self._last_wish, self._blind_is_shown = NONE, EVERY, ("", ""), False
+        self._reference, self._beside = self.choices.design, None
         self._scenes: dict[tuple[str, tuple[str, ...]], list[Scene]] = {}
         self._training: dict[tuple[str, tuple[str, ...]], TrainingScores] = {}
-        self._ended = threading.Event()
+        self._stops, self._ended = threading.Event(), SimpleQueue()
         self._server, self._guard = start_server(port)
         self._page, self._answers = (Worker(f"studio {name}", self._failed) for name in ("page", "answers"))
-        try:
-            spec = first.specification
-            self._stage = Stage(
-                self._server, spec.frame, spec.mount is not None, partial(self.wish, "handle"), self._drag
-            )
-            names, parts = [*self.saved] or [first.name], load_library().names
-            self._panel = Panel(self._server, self.choices, names, FIXED_BASELINES, parts, self.wish)
-            for name in ("/density", "/blind"):
-                self._stage.set_visible(name, False)
-            self._refresh()
-        except BaseException:
-            self.stop()
-            raise
+        design = self.choices.design
+        self._stage = Stage(self._server, design.specification, partial(self.wish, "handle"), self._drag)
+        names = [*self.saved] or [design.name]
+        self._panel = ControlPanel(self._server, self.choices, names, FIXED_BASELINES, load_library().names, self.wish)
+        self._refresh()
 
     @property
     def address(self) -> str:
@@ -160,27 +138,37 @@ class Studio:
         for worker in (self._page, self._answers):
             worker.stop()
         stop_server(self._server)
-        self._ended.set()
+        self.end()
+
+    def __enter__(self) -> Studio:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def end(self) -> None:
+        """End `wait`; what handles a signal may call it."""
+        self._ended.put(None)
 
     def wait(self) -> None:
         """Wait until the page is stopped."""
-        self._ended.wait()
+        self._ended.get()
 
     def _repr_html_(self) -> str:
         return f'<iframe src="{escape(self.address)}" width="100%" height="700" style="border:0"></iframe>'
 
     def wish(self, name: str, value: Any = None) -> None:
-        """Do what a user asks for on the page: a control's name and its new value."""
-        self._page.ask(f"{name} {value[0]}" if name in ("limit", "layer") else name, partial(self._do, name, value))
+        """Do what a user asks for on the page: the name of a wish, and its value."""
+        key = (name, value[0]) if isinstance(value, tuple) else (name, "")
+        self._page.ask(key, partial(self._do, key, value))
 
-    def _do(self, name: str, value: Any) -> None:
-        changed = getattr(self, f"_on_{name}")(value)
+    def _do(self, key: tuple[str, str], value: Any) -> None:
+        changed = getattr(self, f"_on_{key[0]}")(value)
         if changed is None:
             self._show_controls()
         else:
-            # a slider passes many values on its way
-            self._change(changed, merges=name in SLIDERS and name == self._last)
-        self._last = name
+            self._change(changed, merges=key in SLID and key == self._last_wish)
+        self._last_wish = key
 
     def _change(self, choices: Choices, *, merges: bool = False) -> None:
         """Take over other choices; Undo goes back to those before, or before the last change where they merge."""
@@ -199,20 +187,15 @@ class Studio:
         with self._server.atomic():
             self._draw(choices.design, choices.detector)
             self._show_controls()
-            self._show_handle()
+            is_free = bool(np.less(*self._ends_m).any())
+            self._stage.show_handle(self._pose(), turns=not self._handle.startswith(MOUNT), moves=is_free)
         self._answers.ask("score", partial(self._score, choices, self._beside))
-        if self._blind_is_shown:
-            self._answers.ask("blind", partial(self._find_blind, choices))
+        self._answers.ask("blind", partial(self._find_blind, choices))
 
     def _scenes_of(self, choices: Choices) -> list[Scene]:
         key = choices.split, choices.settings
         if key not in self._scenes:
-            from lidardesign.config import with_task_settings
-
-            run = self.run
-            if choices.settings:
-                run = replace(run, config=with_task_settings(run.task, run.config, choices.settings))
-            self._scenes[key] = run.scenes(choices.split, run.config.seed)
+            self._scenes[key] = self.run.with_settings(choices.settings).scenes(choices.split, self.run.config.seed)
         return self._scenes[key]
 
     def _seen(self, design: Design, choices: Choices, detector: str = "ideal") -> SeenScene:
@@ -220,20 +203,18 @@ class Studio:
         return design.simulate([scene], detector=detector, settings=choices.settings, notes=ignore)[0]
 
     def _draw(self, design: Design, detector: str = "ideal") -> None:
-        """Draw a design in the scene that is chosen."""
-        choices = self.choices
-        seen = self._seen(design, choices, detector)
+        """Draw a design in the scene that is chosen, and the one beside it."""
+        choices, seen = self.choices, self._seen(design, self.choices, detector)
         self._frames, self._mbps = len(seen.returns), mean_mbps([one.rays for one in seen.returns], Bandwidth())
-        number = min(choices.frame, self._frames - 1)
-        one = seen.returns[number]
+        one = seen.returns[min(choices.frame, self._frames - 1)]
         self._stage.show_scene(seen.scene, one.frame, [one.rays for one in seen.returns])
-        self._stage.show_seen(seen, number)
+        self._stage.show_seen(seen.scene, one)
         self._stage.show_sensors(design.specification.sensors, self._handle)
-        self._stage.show_places(choices.mounts_m, self._boxes(choices))
+        self._stage.show_places(choices.mounts_m, choices.boxes(self._ends_m))
         if self._beside is not None:
             beside = self._seen(self._beside, choices, detector)
-            self._stage.show_seen(beside, min(number, len(beside.returns) - 1), "beside", BESIDE)
-            self._stage.show_sensors(self._beside.specification.sensors, None, "beside", BESIDE)
+            self._stage.show_seen(beside.scene, beside.returns[min(choices.frame, len(beside.returns) - 1)], BESIDE)
+            self._stage.show_sensors(self._beside.specification.sensors, None, BESIDE)
         counts = Counter(one.outcome.tolist())
         words = [
             f'<span style="color:rgb{COLOURS[int(code)]}">&#9632;</span> {counts[int(code)]} {word}'
@@ -242,127 +223,69 @@ class Studio:
         ]
         self._panel.outcomes.content = f"{len(one.rays)} rays: {', '.join(words)}"
 
-    def _boxes(self, choices: Choices) -> list[np.ndarray]:
-        """The boxes that bound places: of the run, of the constraints, and those that are excluded."""
-        (low, high), origin = self._ends_m, choices.constraints.get("origin", {})
-        ends = [(low, high), (origin.get("low_m", low), origin.get("high_m", high))]
-        ends += [(box["low_m"], box["high_m"]) for box in origin.get("exclude", ())]
-        return [np.array(pair, dtype=np.float64) for pair in ends]
-
     def _show_controls(self) -> None:
-        choices = self.choices
-        counts = len(self._scenes_of(choices)), self._frames
-        self._panel.show(choices, self._handle, self._scope, counts)
+        counts = len(self._scenes_of(self.choices)), self._frames
+        self._panel.show(self.choices, self._handle, self._scope, counts)
+        self._panel.show_pose(self.choices, self._handle, self._pose())
 
-    def _show_handle(self) -> None:
-        pose, free = self._pose(), np.less(*self._ends_m)
-        is_sensor = not self._handle.startswith("mount ")
-        self._stage.show_handle(pose, turns=is_sensor, free=free.tolist())
-        self._show_pose(pose)
-
-    def _show_pose(self, pose: Pose | None) -> None:
-        is_sensor, number, fixed = not self._handle.startswith("mount "), self._number(), []
-        each = self.choices.constraints.get("each") or []
-        if is_sensor and number is not None and number < len(each):
-            entry = each[number]
-            fixed = [word for word, key in (("place", "origin"), ("boresight", "boresight")) if key in entry]
-        frame = self.choices.design.specification.frame
-        self._panel.show_pose(self._handle, pose, fixed, frame, turns=is_sensor)
-
-    def _number(self) -> int | None:
-        """The number of the sensor or mount that has the handle; None without one."""
-        names = [sensor.name for sensor in self.choices.sensors]
-        if self._handle in names:
-            return names.index(self._handle)
-        kind, _, number = self._handle.partition(" ")
-        found = int(number) if kind == "mount" and number.isdecimal() else -1
-        return found if 0 <= found < len(self.choices.mounts_m) else None
-
-    def _pose(self) -> Pose | None:
-        number = self._number()
-        # held-out scenes are looked at, and nothing is placed by them
-        if number is None or self.choices.split == "test":
-            return None
-        if self._handle.startswith("mount "):
-            return Pose.of(self.choices.mounts_m[number], (0.0, 0.0, 0.0))
-        return Pose.of_sensor(self.choices.sensors[number])
+    def _pose(self) -> SensorPose | None:
+        """The pose of what has the handle; None without one, and where held-out scenes are looked at."""
+        return None if self.choices.split == "test" else self.choices.poses.get(self._handle)
 
     # What a user asks for: each gives the changed choices, or None.
 
-    def _drag(self, pose: Pose, ended: bool) -> None:
+    def _drag(self, pose: SensorPose, ended: bool) -> None:
         self._page.ask("drag", partial(self._move, pose, ended))
 
-    def _move(self, pose: Pose, ended: bool) -> None:
+    def _move(self, pose: SensorPose, ended: bool) -> None:
         """Let rays follow the handle; once it is let go, what has changed is fixed."""
-        number, before = self._number(), self._pose()
-        if number is None or before is None:
+        before, choices = self._pose(), self.choices
+        if before is None:
             return
         # what moves along a condition has no place of its own
         is_carried = bool(self.run.config.space.conditioned)
         place = before.place_m if is_carried else np.clip(pose.place_m, *self._ends_m)
-        pose = Pose.of(place, pose.angles_deg)
-        if pose == before:
-            self._stage.place_handle(pose)
-            return
-        if self._handle.startswith("mount "):
-            moved = self.choices.mount_moved(number, pose.place_m)
-        else:
-            moved = self.choices.moved(number, pose)
-        if ended:
+        pose = SensorPose.of(place, pose.angles_deg)
+        moved = choices if pose == before else choices.moved(self._handle, pose)
+        if ended and moved is not choices:
             self._change(moved)
             return
         with self._server.atomic():
-            if moved.design is self.choices.design:
-                self._stage.show_places(moved.mounts_m, self._boxes(moved))
-            else:
-                self._draw(moved.design)
-            self._show_pose(pose)
+            self._draw(moved.design)
+            self._stage.show_places(moved.mounts_m, moved.boxes(self._ends_m))
+            self._panel.show_pose(choices, self._handle, pose)
 
-    def _on_place(self, value: Any) -> None:
+    def _on_pose(self, value: Any) -> None:
+        which, numbers = value
         pose = self._pose()
         if pose is not None:
-            self._move(Pose.of(value, pose.angles_deg), True)
+            self._move(SensorPose.of(**{**vars(pose), which: numbers}), True)
 
-    def _on_angles(self, value: Any) -> None:
-        pose = self._pose()
-        if pose is not None and np.isfinite(value).all():
-            azimuth, elevation, roll = value
-            self._move(Pose.of(pose.place_m, (azimuth, min(max(elevation, -90.0), 90.0), roll)), True)
-
-    def _on_free(self, _: Any) -> Choices | None:
-        number = self._number()
-        return None if number is None else self.choices.freed(number)
+    def _on_free(self, _: Any) -> Choices:
+        return self.choices.freed(self._handle)
 
     def _on_handle(self, value: Any) -> None:
-        self._handle = str(value)
-        if self._number() is None:
-            self._handle = NONE
-        with self._server.atomic():
-            self._stage.show_sensors(self.choices.sensors, self._handle)
-            self._show_handle()
+        self._handle = value if value in self.choices.poses else NONE
+        self._refresh()
 
     def _on_design(self, value: Any) -> Choices | None:
-        return _loaded(self.run, self.saved[value], self.choices) if value in self.saved else None
+        return Choices.of(self.run, self.saved[value], self.choices) if value in self.saved else None
 
     def _on_beside(self, value: Any) -> None:
         self._stage.remove("/beside")
         self._beside = self.saved.get(value)
         if value in FIXED_BASELINES:
-            self._answers.ask("baseline", partial(self._find_baseline, value, self.choices))
+            self._answers.ask("beside", partial(self._find_baseline, value, self.choices))
         self._refresh()
 
-    def _on_split(self, value: Any) -> None:
-        self._look(split=SPLITS.get(value, "train"), scene=0, frame=0)
-
-    def _on_scene(self, value: Any) -> None:
-        last = len(self._scenes_of(self.choices)) - 1
-        self._look(scene=min(max(int(value), 0), last), frame=0)
-
-    def _on_frame(self, value: Any) -> None:
-        self._look(frame=min(max(int(value), 0), self._frames - 1))
-
-    def _look(self, **place: Any) -> None:
+    def _on_look(self, value: Any) -> None:
         """Show another scene or frame, which changes nothing that could be undone."""
+        which, asked = value
+        if which == "split":
+            place = {"split": SPLITS.get(asked, "train"), "scene": 0, "frame": 0}
+        else:
+            most = len(self._scenes_of(self.choices)) if which == "scene" else self._frames
+            place = {which: min(max(int(asked), 0), most - 1)}
         self.choices = replace(self.choices, **place)
         self._refresh()
 
@@ -373,75 +296,44 @@ class Studio:
             self._blind_is_shown = bool(is_shown)
             self._answers.ask("blind", partial(self._find_blind, self.choices))
         if name == "density":
-            config = self.run.config
-            samples = load_samples(self.run.folder, config.space)
-            points = samples.resample(DENSITY_POINTS, random_generator(config.seed, "studio"))
+            samples = load_samples(self.run.folder, self.run.config.space)
+            points = samples.resample(DENSITY_POINTS, random_generator(self.run.config.seed, "studio"))
             self._stage.show_density(observed_point(points))
 
     def _on_scope(self, value: Any) -> None:
-        self._scope = str(value) if value in [sensor.name for sensor in self.choices.sensors] else EVERY
-
-    def _on_sensors(self, value: Any) -> Choices:
-        count = "parts.count" if "parts" in self.choices.constraints else "sensors.count"
-        changed = self.choices.constrained(count, str(int(value)))
-        each = list(changed.constraints.get("each") or ())[: int(value)]
-        return replace(changed, constraints={**changed.constraints, **({"each": each} if each else {})})
-
-    def _on_rays(self, value: Any) -> Choices:
-        return self.choices.constrained("budget.rays", str(int(value)))
-
-    def _on_part(self, value: Any) -> Choices | None:
-        if value == ANY:
-            return self.choices.constrained("parts", "")
-        if value not in load_library().names:
-            return None
-        return self._made_of(value)
-
-    def _on_module(self, value: Any) -> Choices:
-        field, _, zones = str(value).strip().partition(" ")
-        return self._made_of(f"module-{field}-{zones.strip()}") if value else self.choices.constrained("parts", "")
-
-    def _made_of(self, name: str) -> Choices:
-        from lidardesign.parts.catalogue import find_part
-
-        _check_part_names([name])
-        find_part(name)
-        document = {key: value for key, value in self.choices.constraints.items() if key not in ("sensors", "budget")}
-        document["parts"] = {"names": [name], "count": len(self.choices.sensors)}
-        return replace(self.choices, constraints=Constraints.from_mapping(document).as_document(), state="changed")
+        self._scope = value if value in self.choices.poses else EVERY
 
     def _on_limit(self, value: Any) -> Choices:
-        key, text = value
-        changed = self.choices.constrained(key, str(text), self._scope)
-        names = changed.constraints.get("parts", {}).get("names", ())
-        _check_part_names([] if isinstance(names, str) else names)
-        return changed
+        return self.choices.constrained(value[0], str(value[1]), self._scope)
+
+    def _on_count(self, value: Any) -> Choices:
+        return self.choices.constrained(self.choices.count_key, str(int(value)))
+
+    def _on_part(self, value: Any) -> Choices:
+        return self.choices.made_of(value if value in self._panel.part.options[1:] else None)
 
     def _on_detector(self, value: Any) -> Choices | None:
-        return replace(self.choices, detector=value, state="changed") if value in DETECTORS else None
+        known = value in self._panel.detector.options
+        return replace(self.choices, detector=value, state="changed") if known else None
 
     def _on_light(self, value: Any) -> Choices | None:
-        if value not in LIGHTS:
-            return None
-        scenes = replace(self.choices, settings=LIGHTS[value], state="changed")
-        self._scenes_of(scenes)  # refused where the task has no light
-        return scenes
-
-    def _on_step(self, value: Any) -> None:
-        if value in STEPS:
-            steps = (self._undo, self._redo, self._fit, self._stop, self._score_held_out)
-            steps[STEPS.index(value)]()
+        lit = replace(self.choices, settings=LIGHTS.get(value, ()), state="changed")
+        self._scenes_of(lit)  # refused where the task has no light
+        return lit
 
     def _on_name(self, _: Any) -> None:
         """The command line follows."""
 
-    # Steps.
-
-    def _undo(self) -> None:
-        self._travel(self._before, self._after)
-
-    def _redo(self) -> None:
-        self._travel(self._after, self._before)
+    def _on_step(self, value: Any) -> None:
+        steps = (
+            partial(self._travel, self._before, self._after),
+            partial(self._travel, self._after, self._before),
+            partial(self._answers.ask, "fit", partial(self._find_fit, self.choices)),
+            self._stop_answers,
+            partial(self._answers.ask, "evaluate", partial(self._evaluate, self.choices)),
+        )
+        if value in STEPS:
+            steps[STEPS.index(value)]()
 
     def _travel(self, source: list[Choices], goal: list[Choices]) -> None:
         if source:
@@ -449,19 +341,13 @@ class Studio:
             self._reference, self.choices = self.choices.design, source.pop()
             self._refresh()
 
-    def _stop(self) -> None:
+    def _stop_answers(self) -> None:
         self._answers.drop()
         self._stops.set()
 
-    def _fit(self) -> None:
-        self._answers.ask("fit", partial(self._find_fit, self.choices))
-
-    def _score_held_out(self) -> None:
-        self._answers.ask("evaluate", partial(self._evaluate, self.choices))
-
     # Answers, which are found beside the page and shown where they are still asked for.
 
-    def _step(self, label: str, *_: Any) -> None:
+    def _step(self, label: str | None, *_: Any) -> None:
         """Show what is under way, or end it.
 
         Raises:
@@ -471,41 +357,41 @@ class Studio:
             raise StoppedError
         self._panel.working.content = f"{label} ..." if label else ""
 
-    def _find_fit(self, choices: Choices) -> None:
+    def _begin(self, label: str) -> None:
         self._stops.clear()
-        self._step("fitting")
-        fit = self.run.fit if choices.base is None else choices.base.constrain
+        self._step(label)
+
+    def _find_fit(self, choices: Choices) -> None:
+        self._begin("fitting")
         remarks: list[str] = []
-        design = fit(**choices.fit_arguments(NAME), progress=self._step, notes=remarks.append)
+        design = choices.fit(NAME, progress=self._step, notes=remarks.append)
         self._page.ask("fitted", partial(self._take_fit, choices, design, remarks))
 
     def _take_fit(self, asked: Choices, design: Design, remarks: list[str]) -> None:
-        self._panel.working.content = "  \n".join(map(str, remarks[-3:]))
-        if self.choices.key == asked.key:
+        is_new = self.choices.key == asked.key
+        self._panel.working.content = "  \n".join(remarks) if is_new else "the choices have changed: press Fit again"
+        if is_new:
             self._change(replace(self.choices, design=design, state="fitted"))
-        else:
-            self._panel.working.content = "the choices have changed since: the fit is left out"
 
     def _find_baseline(self, name: str, choices: Choices) -> None:
-        self._stops.clear()
-        self._step(f"choosing the rays of {name}")
+        self._begin(f"choosing the rays of {name}")
         found = self.run.baseline(name, rays=choices.design.usual_count(ignore))
         self._page.ask("found", partial(self._take_beside, found))
 
     def _take_beside(self, design: Design) -> None:
-        self._panel.working.content = ""
-        self._beside = design
+        self._panel.working.content, self._beside = "", design
         self._refresh()
 
     def _find_blind(self, choices: Choices) -> None:
-        surface = self._seen(choices.design, choices).unseen() if self._blind_is_shown else None
-        self._page.ask("blind", partial(self._stage.show_blind, *(surface or (np.zeros((0, 3)), np.zeros((0, 3))))))
+        if self._blind_is_shown:
+            surface = self._seen(choices.design, choices).unseen()
+            self._page.ask("blind", partial(self._stage.show_blind, *surface))
 
     def _score(self, choices: Choices, beside: Design | None) -> None:
-        key = choices.detector, choices.settings
+        key, metric = (choices.detector, choices.settings), self.run.metric
         if key not in self._training:
             self._training[key] = TrainingScores(self.run, detector=choices.detector, settings=choices.settings)
-        scores, metric = self._training[key], self.run.metric
+        scores = self._training[key]
         text = f"**{_figure(scores.score(choices.design), metric.unit)}** {metric.name}, {metric.better} is better, "
         text += f"on {len(scores.scenes)} training scenes that no fit chooses on"
         for name, other in (("before the last change", self._reference), (beside and beside.name, beside)):
@@ -514,24 +400,17 @@ class Studio:
         self._page.ask("scored", partial(self._show_status, choices, text))
 
     def _show_status(self, choices: Choices, text: str) -> None:
-        if choices.design is not self.choices.design:
-            return
-        design, count = choices.design, choices.design.usual_count(ignore)
-        state = "changed: press Fit" if choices.state == "changed" else f"as {choices.state}"
-        sensors = f"{len(choices.sensors)} sensor{'s' * (len(choices.sensors) != 1)}"
-        head = f"**{design.name}** ({state}): {sensors}, {count} rays, {self._mbps:.3g} Mbit/s"
-        tight = sorted(choices.tight())
-        further = f"  \ntight: {', '.join(tight)}" if tight else ""
-        self._panel.status.content = f"{head}  \n{text}{further}"
+        if choices.design is self.choices.design:
+            tight = sorted(choices.tight())
+            further = f"  \ntight: {', '.join(tight)}" if tight else ""
+            self._panel.status.content = f"{choices.headline}, {self._mbps:.3g} Mbit/s  \n{text}{further}"
 
     def _evaluate(self, choices: Choices) -> None:
-        self._stops.clear()
-        self._step("scoring on held-out scenes")
-        designs, beside = [choices.design], self._beside
-        if beside is not None and self.saved.get(beside.name) is beside and beside.name != choices.design.name:
-            designs.append(beside)
+        self._begin("scoring on held-out scenes")
+        beside = self._beside
+        is_saved = beside is not None and self.saved.get(beside.name) is beside and beside.name != choices.design.name
         scores = self.run.evaluate(
-            designs,
+            [choices.design, *([beside] if is_saved else [])],
             rays=[choices.design.usual_count(ignore)],
             detector=choices.detector,
             settings=choices.settings,
@@ -548,40 +427,38 @@ class Studio:
             for row in scores.rows
         )
         text = f"{scores.evaluation.scenes} **held-out** scenes, which nothing was chosen on; "
-        text += f"{metric.better} is better.\n\n"
-        text += f"| | rays | Mbit/s | {metric.name} [{metric.unit}] |\n|---|---|---|---|\n{rows}"
+        text += (
+            f"{metric.better} is better.\n\n| | rays | Mbit/s | {metric.name} [{metric.unit}] |\n|---|---|---|---|\n"
+        )
         self._panel.working.content = ""
-        self._panel.show_scores(text, scores.figure("bandwidth"))
+        self._panel.show_scores(f"{text}|---|---|---|---|\n{rows}", scores.figure("bandwidth"))
 
     # What is kept.
 
     def _on_save(self, _: Any) -> None:
-        name, choices = str(self._panel.name.value).strip(), self.choices
+        name, choices, folder = str(self._panel.name.value).strip(), self.choices, self.run.folder
         FitOptions(name=name)  # refuses what no design may be called
         if choices.state != "fitted":
             raise ConfigError("there is no fit of these choices yet", where="Save", hint="press Fit first")
         if self.run.design_path(name).exists():
             raise ConfigError(f"there is a design {name!r}", where="name", allowed="another name")
-        design = Design(replace(choices.design.specification, name=name), self.run, None, choices.design.result)
+        design = Design(replace(choices.design.specification, name=name), self.run)
         design.save()
-        with run_lock(self.run.folder, wait_s=WAIT_S):
-            write_recorded(self.run.folder, f"{CONSTRAINTS}/{name}.yaml", dump_yaml(dict(choices.constraints)).encode())
+        with run_lock(folder, wait_s=WAIT_S):
+            write_recorded(folder, f"{CONSTRAINTS}/{name}.yaml", dump_yaml(dict(choices.constraints)).encode())
         self.saved[name] = design
         self._panel.add_design(name)
-        self._panel.saved.content = f"saved {design.path} and {self.run.folder / CONSTRAINTS / name}.yaml"
-
-    def _on_export(self, _: Any) -> None:
-        self._export(str(self._panel.format.value))
+        self._panel.saved.content = f"saved {design.path} and {folder / CONSTRAINTS / name}.yaml"
 
     def _on_mounts(self, _: Any) -> None:
-        self._export("mounts")
+        self._on_export("mounts")
 
-    def _export(self, name: str) -> None:
+    def _on_export(self, value: Any) -> None:
         design = self.saved.get(str(self._panel.name.value).strip())
-        if design is None or name not in EXPORTERS:
+        if design is None:
             raise ConfigError("only saved designs are exported", where="Export", hint="press Save first")
-        exported = design.export(format=name, notes=ignore)
-        self._panel.saved.content = f"wrote {exported.path}"
+        if value in EXPORTERS:
+            self._panel.saved.content = f"wrote {design.export(format=value, notes=ignore).path}"
 
     def _failed(self, error: Exception) -> None:
         """Show what went wrong; the page goes on."""
@@ -589,33 +466,12 @@ class Studio:
             self._panel.working.content = "stopped"
             return
         is_known = isinstance(error, LidardesignError)
-        title = "This cannot be done" if is_known else "This is a bug"
-        body = str(error) if is_known else f"{type(error).__name__}: {error}"
+        title, body = ("This cannot be done", f"{error}") if is_known else ("This is a bug", f"{error!r}")
         # a tab that is opened later shows it, too
         self._panel.working.content = f"**{title}**\n```\n{body}\n```"
         for client in self._server.get_clients().values():
             client.add_notification(title, body, color="red")
         self._show_controls()
-
-
-def _loaded(run: Run, design: Design, shown: Choices | None = None) -> Choices:
-    """The choices with a design and its constraints; it is fitted again where it is saved in the run."""
-    base = design if design.path is not None else None
-    constraints = Constraints.from_mapping(design.specification.constraints).as_document()
-    if shown is None:
-        return Choices(run, design, constraints, base)
-    return replace(shown, design=design, constraints=constraints, base=base, state="saved")
-
-
-def _check_part_names(names: list[str]) -> None:
-    """Refuse paths of part files: the page opens no files.
-
-    Raises:
-        ConfigError: There is one.
-    """
-    for name in names:
-        if "/" in name or "\\" in name or name.endswith(".yaml"):
-            raise ConfigError(f"{name!r} is a path", where="parts.names", allowed="names of parts in the catalogue")
 
 
 def _figure(interval: Interval, unit: str, word: str = "") -> str:
@@ -626,12 +482,10 @@ def _figure(interval: Interval, unit: str, word: str = "") -> str:
 
 def _compared(difference: Interval, metric: Metric) -> str:
     """A difference of scores, as `0.3 mm better (0.1 to 0.5)`."""
-    is_better = (difference.mean < 0) == (metric.better == "lower")
+    if not difference.mean:
+        return "no better or worse"
+    word = "better" if (difference.mean < 0) == (metric.better == "lower") else "worse"
     if difference.mean < 0:
         ends = [None if end is None else -end for end in (difference.high, difference.low)]
         difference = Interval(-difference.mean, *ends)
-    return (
-        _figure(difference, metric.unit, "better" if is_better else "worse")
-        if difference.mean
-        else "no better or worse"
-    )
+    return _figure(difference, metric.unit, word)

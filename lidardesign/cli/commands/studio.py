@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import signal
 import webbrowser
-from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -38,11 +38,10 @@ def studio(
         chosen = None if design is None else load_design(design, opened, output.remark)
         with output.progress("opening"):
             page = opened.studio(chosen, port=port)
-        try:
+        with page:
+            # an exception in the wrong moment could be lost
+            signal.signal(signal.SIGINT, lambda *_: page.end())
             print(page.address, flush=True)
             if not no_browser:
                 webbrowser.open(page.address)
-            with suppress(KeyboardInterrupt):
-                page.wait()
-        finally:
-            page.stop()
+            page.wait()
