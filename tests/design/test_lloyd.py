@@ -14,7 +14,9 @@ def cloud(seed, count=400, dimensions=2):
 
 
 def means(features, weights, labels):
-    return np.array([np.average(features[labels == k], axis=0, weights=weights[labels == k]) for k in np.unique(labels)])
+    return np.array(
+        [np.average(features[labels == k], axis=0, weights=weights[labels == k]) for k in np.unique(labels)]
+    )
 
 
 @pytest.mark.parametrize("count", [1, 2, 7, 40])

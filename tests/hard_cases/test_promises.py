@@ -205,8 +205,10 @@ class TestNoNaNLeaves:
     def test_figures_of_any_finite_weights_are_finite(self, log_weights, offset):
         log_target = np.array(log_weights)
         found = quality(np.full(len(log_target), offset), log_target)
-        assert all(math.isfinite(value) for value in vars(found).values() if value is not None)
-        covered = coverage(np.zeros(len(log_target)), log_target, np.full(len(log_target), offset), found.log_z)
+        assert all(math.isfinite(number) for one in found.values() for number in (one.value, one.error))
+        covered = coverage(
+            np.zeros(len(log_target)), log_target, np.full(len(log_target), offset), found["log_z"].value
+        )
         assert 0 <= covered.value <= 1
 
     def test_rays_that_meet_nothing_give_a_status_and_no_number(self):
