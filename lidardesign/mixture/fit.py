@@ -75,11 +75,6 @@ class FitProblem:
     restarts: int = RESTARTS
     em_samples: int = EM_SAMPLES
 
-    @property
-    def interval(self) -> float:
-        """The standard deviations on each side of a mean that an interval spans."""
-        return interval_factor(self.level)
-
 
 @dataclass(frozen=True, eq=False)
 class FittedSensors:
@@ -254,7 +249,7 @@ def _group_samples(
             chosen = systematic_draw(weights, problem.em_samples, generator)
             points, weights = points[generator.permutation(chosen)], np.ones(problem.em_samples)
         features = Features.of(points, weights, Axes.of(space, group.pins), space)
-        bounds = bounds_of(rules, space, group.sensors, problem.interval)
+        bounds = bounds_of(rules, space, group.sensors, interval_factor(problem.level))
         parts.append(GroupSamples(group, float(shares[index]), features, bounds))
     return parts
 
