@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Literal
@@ -88,10 +88,6 @@ class Samples:
     def subset(self, keep: np.ndarray) -> Samples:
         """The samples at an index or mask."""
         return Samples(self.points[keep], self.log_prob[keep], self.log_target[keep], self.space)
-
-    def retargeted(self, log_target: np.ndarray) -> Samples:
-        """The samples with another log p*, shape (N,)."""
-        return replace(self, log_target=log_target)
 
     def resample(self, count: int, generator: np.random.Generator) -> np.ndarray:
         """Design points drawn from p* by systematic importance resampling, shape (count, 6)."""

@@ -200,7 +200,7 @@ class Fitter:
             self._check_effective(loaded, "learn longer (--preset standard or fine), or with a larger density.sigma_m")
             if settings:
                 before = loaded.effective_sample_size
-                loaded = loaded.retargeted(self.target(loaded.points))
+                loaded = replace(loaded, log_target=self.target(loaded.points))
                 self._check_effective(loaded, "choose a setting nearer to the learned one, or learn with it")
                 text = f"with {', '.join(settings)} the samples have ESS {loaded.effective_sample_size:.2f}"
                 notes(BackgroundNote(f"{text}, and {before:.2f} as learned"))

@@ -17,6 +17,7 @@ angles scale by the cosine of the fixed elevation; where only the elevation is f
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -69,12 +70,6 @@ class Mixture:
     def frames(self) -> np.ndarray:
         """Rows forward, horizontal, vertical of each boresight, roll included, shape (K, 3, 3)."""
         return frames(self.azimuth_rad, self.elevation_rad, self.roll_rad)
-
-    def take(self, order: np.ndarray) -> Mixture:
-        """The components at indices, their weights scaled to sum to 1."""
-        rows = {name: getattr(self, name)[order] for name in self.__dataclass_fields__}
-        rows["weights"] = rows["weights"] / rows["weights"].sum()
-        return Mixture(**rows)
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,48 +154,42 @@ def angular_rows(mixture: Mixture, axes: Axes) -> np.ndarray:
     return rows
 
 
-class _Block:
-    """Log joint densities of one block of samples, (K, n), with the angular arrays that led to them."""
+_Evaluated = tuple[slice, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
-    def __init__(self, mixture: Mixture, features: Features) -> None:
-        self.features, self.axes, self.count = features, features.axes, len(mixture)
-        self.coefficients = linear_coefficients(mixture, features)
-        self.rows = angular_rows(mixture, features.axes).reshape(3 * self.count, 3)
-        size = min(BLOCK, len(features))
-        self.buffers = np.empty((6, self.count * size))
 
-    def evaluate(self, part: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Exponents without t / sin t, that ratio, and scaled tangent coordinates h, v, each (K, n)."""
-        n = part.stop - part.start
-        shape = (self.count, n)
-        views = self.buffers[:, : self.count * n]
-        exponent, ratio, work = (views[i].reshape(shape) for i in (3, 4, 5))
-        np.matmul(self.coefficients, self.features.phi[:, part], out=exponent)
-        if not self.axes.angular:
-            return exponent, ratio, ratio, ratio
-        cosines = self.buffers.reshape(-1)[: 3 * self.count * n].reshape(3 * self.count, n)
-        np.matmul(self.rows, self.features.directions[:, part], out=cosines)
+def _evaluated(mixture: Mixture, features: Features) -> Iterator[_Evaluated]:
+    """Log joint densities of blocks of samples, in arrays that the next block overwrites.
+
+    Each block with its exponents without t / sin t, that ratio, and scaled tangent coordinates h, v, (K, n) each.
+    """
+    count, total = len(mixture), len(features)
+    coefficients = linear_coefficients(mixture, features)
+    rows = angular_rows(mixture, features.axes).reshape(3 * count, 3)
+    buffers = np.empty((6, count * min(BLOCK, total)))
+    for start in range(0, total, BLOCK):
+        part = slice(start, min(start + BLOCK, total))
+        shape = count, part.stop - start
+        exponent, ratio, work = (buffers[i, : math.prod(shape)].reshape(shape) for i in (3, 4, 5))
+        cosines = buffers.reshape(-1)[: 3 * math.prod(shape)].reshape(3 * count, -1)
         forward, horizontal, vertical = cosines.reshape(3, *shape)
-        angle_ratio(forward, ratio, work)
-        for tangent in (horizontal, vertical):
-            tangent *= ratio
-            np.multiply(tangent, tangent, out=work)
-            exponent -= work
-        return exponent, ratio, horizontal, vertical
-
-
-def _blocks(count: int) -> list[slice]:
-    return [slice(start, min(start + BLOCK, count)) for start in range(0, count, BLOCK)]
+        np.matmul(coefficients, features.phi[:, part], out=exponent)
+        if features.axes.angular:
+            np.matmul(rows, features.directions[:, part], out=cosines)
+            angle_ratio(forward, ratio, work)
+            for tangent in (horizontal, vertical):
+                tangent *= ratio
+                np.multiply(tangent, tangent, out=work)
+                exponent -= work
+        yield part, exponent, ratio, horizontal, vertical
 
 
 def expect(mixture: Mixture, features: Features) -> Statistics:
     """The E-step: log-likelihood and expected sufficient statistics of weighted samples, in log space."""
-    block, count, axes = _Block(mixture, features), len(mixture), features.axes
+    count, axes = len(mixture), features.axes
     phi = np.zeros((count, len(features.phi)))
     tangent = np.zeros((count, 2, 3))
     total = 0.0
-    for part in _blocks(len(features)):
-        exponent, ratio, horizontal, vertical = block.evaluate(part)
+    for part, exponent, ratio, horizontal, vertical in _evaluated(mixture, features):
         peak = exponent.max(axis=0)
         exponent -= peak
         np.exp(exponent, out=exponent)
@@ -226,26 +215,26 @@ def expect(mixture: Mixture, features: Features) -> Statistics:
     return Statistics(total, phi[:, 0], phi, tangent)
 
 
-def log_density(mixture: Mixture, features: Features) -> np.ndarray:
-    """log q of each sample, shape (N,)."""
-    block, axes = _Block(mixture, features), features.axes
-    result = np.empty(len(features))
-    for part in _blocks(len(features)):
-        exponent, ratio, _, _ = block.evaluate(part)
+def _joint(mixture: Mixture, features: Features) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
+    """Joint densities of blocks of samples, (K, n), less a factor of each sample, of which the log is given, (n,)."""
+    for part, exponent, ratio, _, _ in _evaluated(mixture, features):
         peak = exponent.max(axis=0)
         terms = np.exp(exponent - peak)
-        result[part] = np.log((terms * ratio if axes.angular == 2 else terms).sum(axis=0)) + peak
+        yield part, terms * ratio if features.axes.angular == 2 else terms, peak
+
+
+def log_density(mixture: Mixture, features: Features) -> np.ndarray:
+    """log q of each sample, shape (N,)."""
+    result = np.empty(len(features))
+    for part, terms, peak in _joint(mixture, features):
+        result[part] = np.log(terms.sum(axis=0)) + peak
     return result
 
 
 def responsibilities(mixture: Mixture, features: Features) -> np.ndarray:
     """Posterior shares of the components for each sample, shape (N, K), rows summing to 1."""
-    block, axes = _Block(mixture, features), features.axes
     result = np.empty((len(features), len(mixture)))
-    for part in _blocks(len(features)):
-        exponent, ratio, _, _ = block.evaluate(part)
-        terms = np.exp(exponent - exponent.max(axis=0))
-        terms = terms * ratio if axes.angular == 2 else terms
+    for part, terms, _ in _joint(mixture, features):
         result[part] = (terms / terms.sum(axis=0)).T
     return result
 

@@ -1,22 +1,22 @@
 """Expectation maximisation with restarts: the loop, its seeds, and components that lose their samples.
 
 Seeds are those of weighted Lloyd quantisation, a few centres that stand for many weighted points. Every step of it
-lowers the weighted sum of squared distances, so it ends.
+lowers the weighted sum of squared distances.
 
 References:
     Least squares quantization in PCM, Lloyd 1982. k-means++: the advantages of careful seeding, Arthur and
-    Vassilvitskii 2007. Making k-means even faster, Hamerly 2010.
+    Vassilvitskii 2007.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lidardesign.constraints.origins import nearest_in_boxes
-from lidardesign.errors import BackgroundNote, ConfigError, NumericalError
+from lidardesign.errors import BackgroundNote, NumericalError
 from lidardesign.mixture.bounds import Bounds, Floors, clip_azimuth
 from lidardesign.mixture.components import (
     Features,
@@ -28,7 +28,7 @@ from lidardesign.mixture.components import (
     responsibilities,
 )
 from lidardesign.mixture.m_step import SMALLEST_MASS, maximise
-from lidardesign.numerics import COARSE_SLACK, ROUNDING, SLACK, SQUARABLE, TINY, effective_count, wrap_angle
+from lidardesign.numerics import ROUNDING, SQUARABLE, TINY, effective_count, wrap_angle
 
 # Iterations stop when the mean log-likelihood gains less than this per iteration [nats].
 CONVERGENCE_NATS = 1e-5
@@ -52,9 +52,6 @@ SMALLEST_STEP = 0.02
 SMALLEST_CELL = TINY
 # Up to so many centres a brute-force search is as fast as a tree, and imports nothing.
 FEW_CENTRES = 10
-# The iteration stops when no centre moves by more than this share of the features' extent: far below the
-# spacing of any ray layout, far above rounding.
-MOVEMENT_TOLERANCE = COARSE_SLACK
 # Seeds are drawn among at most so many points per centre: seeding costs N * K, an iteration only N log K.
 SEED_POOL = 16
 # Relative weights below this one count as it, so that the mass of a cell never underflows to nothing.
@@ -70,14 +67,12 @@ class EMResult:
         log_likelihood: Weighted mean log density [nats].
         history: Log-likelihood after every accepted step; it never decreases.
         notes: Lines on restarted components.
-        values: The log density of each sample [nats], shape (N,); None where it was not kept.
     """
 
     mixture: Mixture
     log_likelihood: float
     history: tuple[float, ...]
-    notes: tuple[str, ...] = field(default=())
-    values: np.ndarray | None = None
+    notes: tuple[str, ...] = ()
 
 
 def run_em(
@@ -160,7 +155,7 @@ def seed_mixture(features: Features, bounds: Bounds, generator: np.random.Genera
     chosen = generator.choice(len(features), min(SEED_SAMPLES, len(features)), replace=False)
     part = features.subset(np.sort(chosen)) if len(chosen) < len(features) else features
     seeds = np.ascontiguousarray(part.embedding)
-    _, labels = lloyd(seeds, part.weights, len(bounds), generator, iterations=SEED_LLOYD_ITERATIONS)
+    labels = lloyd(seeds, part.weights, len(bounds), generator, iterations=SEED_LLOYD_ITERATIONS)
     return mixture_of_labels(part, _match_cells(part, labels, bounds), bounds)
 
 
@@ -245,7 +240,7 @@ def _revive_dead(result: EMResult, features: Features, bounds: Bounds, generator
         for component in dead:
             inside = np.flatnonzero(labels == np.bincount(labels, features.weights).argmax())
             part = features.subset(inside)
-            _, halves = lloyd(np.ascontiguousarray(part.embedding), part.weights, 2, generator, iterations=2)
+            halves = lloyd(np.ascontiguousarray(part.embedding), part.weights, 2, generator, iterations=2)
             labels[inside[halves == 1]] = component
         again = run_em(mixture_of_labels(features, labels, bounds), features, bounds)
         left = _dead(again.mixture, features)
@@ -264,68 +259,32 @@ def _dead(mixture: Mixture, features: Features) -> np.ndarray:
 
 
 def lloyd(
-    features: np.ndarray,
-    weights: np.ndarray,
-    count: int,
-    generator: np.random.Generator,
-    *,
-    iterations: int = 50,
-) -> tuple[np.ndarray, np.ndarray]:
-    r"""Centres that minimise $\sum_n w_n \min_k |f_n - c_k|^2$ locally.
+    features: np.ndarray, weights: np.ndarray, count: int, generator: np.random.Generator, *, iterations: int
+) -> np.ndarray:
+    r"""Cells whose centres lower $\sum_n w_n \min_k |f_n - c_k|^2$ at every step.
 
-    Deterministic for a given generator state. It stops after `iterations` steps, or before, once no centre
-    moves by more than 1e-6 of the features' extent. A cell that loses all its points takes the point that is
-    worst represented, so with at least `count` distinct points of positive weight no cell is empty; with
-    fewer, every distinct point is a centre and the rest repeat them in order of weight, with empty cells.
+    Deterministic for a given generator state. A cell that loses all its points takes the point that is worst
+    represented, so with at least `count` distinct points of positive weight no cell is empty; with fewer, every
+    distinct point has a cell of its own.
 
     Arguments:
         features: Points, shape (N, F), in units that make the Euclidean distance the right one.
         weights: Non-negative, not all zero, shape (N,).
-        count: Number of centres K, at least 1.
+        count: Number of cells K, at least 1.
         generator: Source of the seeding.
-        iterations: At most this many steps.
+        iterations: The number of steps.
 
     Returns:
-        Centres, shape (K, F), and the centre of each point, shape (N,).
-
-    Raises:
-        ConfigError: No points, shapes that do not fit, values that are not finite, or a count below 1.
+        The cell of each point, shape (N,).
     """
-    features, weights = _checked(features, weights, count)
     distinct, inverse, merged = _distinct(features, weights)
     if len(distinct) <= count:
-        heaviest = np.argsort(-merged, kind="stable")
-        return np.concatenate([distinct, distinct[np.resize(heaviest, count - len(distinct))]]), inverse
-    offset = distinct.mean(axis=0)
-    points = distinct - offset
-    tolerance = MOVEMENT_TOLERANCE * np.ptp(points, axis=0).max()
+        return inverse
+    points = distinct - distinct.mean(axis=0)
     centres = _seed(points, merged, count, generator)
-    nearest = Nearest(points)
     for _ in range(iterations):
-        labels, _ = _assign(nearest, merged, centres)
-        moved = _centroids(points, merged, labels, count)
-        shift = np.abs(moved - centres).max()
-        centres = moved
-        if shift <= tolerance:
-            break
-    labels, refilled = _assign(nearest, merged, centres)
-    centres[refilled] = _centroids(points, merged, labels, count)[refilled]
-    return centres + offset, labels[inverse]
-
-
-def _checked(features: np.ndarray, weights: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    features = np.asarray(features, dtype=np.float64)
-    weights = np.asarray(weights, dtype=np.float64)
-    if features.ndim != 2 or not features.size or weights.shape != features.shape[:1]:
-        shapes = f"features of shape {features.shape} with weights of shape {weights.shape}"
-        raise ConfigError(shapes, where="quantisation", allowed="(N, F) and (N,), at least one point")
-    if not (np.isfinite(features).all() and np.isfinite(weights).all()):
-        raise ConfigError("features or weights are NaN or infinite", where="quantisation")
-    if weights.min() < 0 or weights.max() <= 0:
-        raise ConfigError("weights are negative or all zero", where="quantisation", allowed="0 or more")
-    if count < 1:
-        raise ConfigError(f"{count} centres", where="quantisation", allowed="1 or more")
-    return features, weights
+        centres = _centroids(points, merged, _assign(points, merged, centres), count)
+    return _assign(points, merged, centres)[inverse]
 
 
 def _distinct(features: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -359,15 +318,10 @@ def _seed(points: np.ndarray, weights: np.ndarray, count: int, generator: np.ran
     columns = np.ascontiguousarray(points.T)
     chosen, squared = np.empty(count, dtype=np.int64), np.full(len(points), 1.0)
     for k, draw in enumerate(generator.uniform(size=count)):
-        mass = weights * squared
-        cumulative = np.cumsum(mass)
-        if cumulative[-1] > 0:
-            # never one without mass, where the draw rounds to the whole
-            index = int(np.searchsorted(cumulative, draw * cumulative[-1], side="right"))
-            chosen[k] = index if index < len(mass) else np.flatnonzero(mass)[-1]
-        else:
-            # every distance underflowed: points that differ by less than the square root of the smallest number
-            chosen[k] = int(draw * len(mass))
+        cumulative = np.cumsum(weights * squared)
+        # the last point where the draw rounds to the whole, or where every distance underflowed
+        index = np.searchsorted(cumulative, draw * cumulative[-1], side="right")
+        chosen[k] = min(index, len(points) - 1)
         away = np.square(columns - columns[:, chosen[k], None]).sum(axis=0)
         squared = np.minimum(squared, away) if k else away
     return points[chosen]
@@ -380,16 +334,15 @@ def _centroids(points: np.ndarray, weights: np.ndarray, labels: np.ndarray, coun
     return np.stack(sums, axis=1) / mass[:, None]
 
 
-def _assign(nearest: Nearest, weights: np.ndarray, centres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The nearest centre of each point, shape (N,), and the cells that had to be refilled.
+def _assign(points: np.ndarray, weights: np.ndarray, centres: np.ndarray) -> np.ndarray:
+    """The nearest centre of each point, shape (N,).
 
     A cell without points takes the point with the largest weighted squared distance from its centre that is
     not alone in its cell; this can only lower the cost.
     """
-    distance, labels = nearest.of(centres)
+    distance, labels = _nearest(points, centres)
     counts = np.bincount(labels, minlength=len(centres))
-    empty = np.flatnonzero(counts == 0)
-    waiting = list(empty)
+    waiting = list(np.flatnonzero(counts == 0))
     for point in np.argsort(-weights * np.square(distance), kind="stable") if waiting else ():
         if not waiting:
             break
@@ -397,63 +350,14 @@ def _assign(nearest: Nearest, weights: np.ndarray, centres: np.ndarray) -> tuple
             counts[labels[point]] -= 1
             labels[point] = waiting.pop(0)
             counts[labels[point]] = 1
-    return labels, empty
+    return labels
 
 
-class Nearest:
-    """Nearest centres of points, repeated for centres that move a little.
-
-    A point whose centre is nearer than the triangle inequality allows any other to be is not searched again (Hamerly
-    2010). The results are those of a search over all points.
-
-    Arguments:
-        points: Shape (N, F).
-    """
-
-    def __init__(self, points: np.ndarray) -> None:
-        self._points = points
-        self._centres = np.empty((0, points.shape[1]))
-        self._labels = np.empty(0, dtype=np.int64)
-        # a lower bound of the distance to any other centre
-        self._others = np.empty(0)
-        # rounding of distances; bounds closer than this are always searched
-        self._slack = SLACK * float(np.ptp(points, axis=0).max(initial=0.0))
-
-    def of(self, centres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The distance to the nearest centre, shape (N,), and its index, shape (N,), which may be changed.
-
-        Arguments:
-            centres: Shape (K, F).
-        """
-        if len(centres) == 1 or centres.shape != self._centres.shape:
-            found, self._labels = _two_nearest(self._points, centres)
-            distance, self._others = found[:, 0].copy(), found[:, 1].copy()
-        else:
-            moved = np.sqrt(np.square(centres - self._centres).sum(axis=1))
-            farthest = int(moved.argmax())
-            others = np.full(len(centres), moved[farthest])
-            # the centre that moved farthest is not among its own others
-            others[farthest] = np.partition(moved, -2)[-2]
-            self._others -= others[self._labels]
-            distance = np.sqrt(np.square(self._points - centres[self._labels]).sum(axis=1))
-            doubtful = np.flatnonzero(distance + self._slack >= self._others)
-            if len(doubtful):
-                found, self._labels[doubtful] = _two_nearest(self._points[doubtful], centres)
-                distance[doubtful], self._others[doubtful] = found.T
-        self._centres = centres.copy()
-        return distance, self._labels.copy()
-
-
-def _two_nearest(points: np.ndarray, centres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distances to the nearest centre and to the next, shape (N, 2), and the index of the nearest, shape (N,).
-
-    Where there is one centre alone, it is the next as well.
-    """
+def _nearest(points: np.ndarray, centres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The distance to the nearest centre, shape (N,), and its index, shape (N,)."""
     if len(centres) > FEW_CENTRES:
         from scipy.spatial import cKDTree
 
-        found, labels = cKDTree(centres).query(points, k=2)
-        return found, labels[:, 0].copy()
+        return cKDTree(centres).query(points)
     squared = np.stack([np.square(points - centre).sum(axis=1) for centre in centres], axis=1)
-    next_one = min(1, len(centres) - 1)
-    return np.sqrt(np.partition(squared, next_one, axis=1)[:, [0, next_one]]), squared.argmin(axis=1)
+    return np.sqrt(squared.min(axis=1)), squared.argmin(axis=1)

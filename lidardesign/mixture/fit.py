@@ -75,11 +75,6 @@ class FitProblem:
     restarts: int = RESTARTS
     em_samples: int = EM_SAMPLES
 
-    @property
-    def interval(self) -> float:
-        """The standard deviations on each side of a mean that an interval spans."""
-        return interval_factor(self.level)
-
 
 @dataclass(frozen=True, eq=False)
 class FittedSensors:
@@ -254,7 +249,7 @@ def _group_samples(
             chosen = systematic_draw(weights, problem.em_samples, generator)
             points, weights = points[generator.permutation(chosen)], np.ones(problem.em_samples)
         features = Features.of(points, weights, Axes.of(space, group.pins), space)
-        bounds = bounds_of(rules, space, group.sensors, problem.interval)
+        bounds = bounds_of(rules, space, group.sensors, interval_factor(problem.level))
         parts.append(GroupSamples(group, float(shares[index]), features, bounds))
     return parts
 
@@ -268,17 +263,11 @@ def _fixed(
     fixed = fix_origins(rules, places)
     supports = _supports(problem, fixed, count, loose)
     whole = fit_groups(_group_samples(problem, fixed, supports, count), problem.seed, problem.restarts)
-    if not any(
-        _is_widest(part, mixture.mixture.spread_rad) for part, mixture in zip(whole.parts, whole.results, strict=True)
-    ):
+    pairs = zip(whole.parts, whole.results, strict=True)
+    if not any((one.mixture.spread_rad >= WIDEST * part.bounds.spread_high).any() for part, one in pairs):
         return whole, fixed, supports
     supports = _supports(problem, fixed, count, loose, _belonging(problem.samples, ensemble, count))
     return fit_groups(_group_samples(problem, fixed, supports, count), problem.seed, problem.restarts), fixed, supports
-
-
-def _is_widest(part: GroupSamples, spread_rad: np.ndarray) -> bool:
-    """True where any angular spread (K, 2) [rad] is at its upper bound."""
-    return bool((spread_rad >= WIDEST * part.bounds.spread_high).any())
 
 
 def _belonging(samples: Samples, ensemble: Ensemble, count: int) -> np.ndarray:

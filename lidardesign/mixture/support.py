@@ -24,7 +24,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -36,7 +35,6 @@ from lidardesign.mixture.bounds import Group
 from lidardesign.numerics import SLACK, effective_count, normalised_weights, systematic_draw, wrap_angle
 from lidardesign.samples import Samples
 from lidardesign.space import AZIMUTH, DIMENSIONS, ELEVATION, RANGE, DesignSpace, aim, direction, observed_point
-from lidardesign.task import random_generator
 
 Retarget = Callable[[np.ndarray], np.ndarray]
 
@@ -204,7 +202,6 @@ def check_support(support: Support, group: Group, *, mass: float | None, several
 
 # As many as a fit works on.
 MOVED_SAMPLES = 20_000
-_MOVED: WeakKeyDictionary[Samples, dict[tuple[tuple[str, float], ...], Samples]] = WeakKeyDictionary()
 
 
 def at_condition(
@@ -276,27 +273,6 @@ def at_condition(
         )
     # later steps take the first samples as a fair subset, so the random order stays
     return moved.subset(np.sort(parts[best]))
-
-
-def conditioned(samples: Samples, condition: Mapping[str, float], retarget: Retarget | None) -> Samples:
-    """`at_condition` with every condition named, remembered for as long as the samples are.
-
-    Raises:
-        ConfigError: A condition is missing; and as `at_condition`.
-    """
-    missing = [DIMENSIONS[index] for index in samples.space.conditioned if DIMENSIONS[index] not in condition]
-    if missing:
-        raise ConfigError(
-            f"the samples are of a density with the condition {missing[0]}",
-            where="--at",
-            allowed=", ".join(samples.space.condition),
-            hint=f"give --at {missing[0]}=VALUE",
-        )
-    known = _MOVED.setdefault(samples, {})
-    key = tuple(sorted(condition.items()))
-    if key not in known:
-        known[key] = at_condition(samples, condition, retarget, MOVED_SAMPLES, random_generator(0, "condition"))
-    return known[key]
 
 
 def condition_text(condition: Mapping[str, float]) -> str:

@@ -13,6 +13,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -80,18 +81,10 @@ class Library:
             )
         return Part.of_file(stem, file, mode or None, self.origins[stem])
 
-    def in_modes(self, name: str, mode: str = "") -> list[Part]:
-        """A part in one mode, or in all that it has.
-
-        Raises:
-            ConfigError: There is no such part or mode.
-        """
-        modes = [mode] if mode else self.part(name).modes
-        return [self.part(f"{name}:{one}") for one in modes] or [self.part(name)]
-
     def every_mode(self) -> list[Part]:
         """All parts in all their modes, by name."""
-        return [part for name in self.names for part in self.in_modes(name)]
+        modes = {name: self.files[name].modes for name in self.names}
+        return [self.part(f"{name}:{mode}" if mode else name) for name in modes for mode in modes[name] or [""]]
 
 
 def load_library(own: Sequence[Path] = ()) -> Library:
@@ -104,13 +97,7 @@ def load_library(own: Sequence[Path] = ()) -> Library:
     files = dict(_shipped())
     origins = dict.fromkeys(files, SHIPPED)
     taken: dict[str, str] = {}
-    paths: list[Path] = []
-    for path in map(Path, own):
-        inside = sorted(path.glob(f"*{SUFFIX}")) if path.is_dir() else [path]
-        if not inside:
-            raise _no_part_files(path)
-        paths += inside
-    for path in paths:
+    for path in itertools.chain.from_iterable(map(_part_files, map(Path, own))):
         name = part_name(path)
         if name in taken:
             raise ConfigError(f"is a second part called {name!r}", where=str(path), hint=f"the first is {taken[name]}")
@@ -176,11 +163,20 @@ def _named(names: Sequence[str] | str) -> list[Part]:
     if names == "catalog":
         library = load_library()
         return [library.part(name) for name in library.names]
-    inside = [sorted(Path(text).glob(f"*{SUFFIX}")) if Path(text).is_dir() else [text] for text in names]
-    for text, found in zip(names, inside, strict=True):
-        if not found:
-            raise _no_part_files(text)
-    return [find_part(name) for name in dict.fromkeys(itertools.chain.from_iterable(inside))]
+    return [find_part(name) for name in dict.fromkeys(itertools.chain.from_iterable(map(_part_files, names)))]
+
+
+def _part_files(path: Any) -> list[Any]:
+    """The part files in a folder; what is none stands for itself.
+
+    Raises:
+        ConfigError: There are none.
+    """
+    inside = sorted(Path(path).glob(f"*{SUFFIX}")) if Path(path).is_dir() else [path]
+    if not inside:
+        hint = f"{page('catalog.md')} shows a part file"
+        raise ConfigError(f"holds no file *{SUFFIX}", where=str(path), hint=hint)
+    return inside
 
 
 def _module(name: str) -> Part:
@@ -227,10 +223,6 @@ def part_name(path: Path) -> str:
             f"{path.stem!r} is not a name of a part", where=str(path), allowed="a file name of a-z, 0-9, dot, dash, _"
         )
     return path.stem
-
-
-def _no_part_files(path: str | Path) -> ConfigError:
-    return ConfigError(f"holds no file *{SUFFIX}", where=str(path), hint=f"{page('catalog.md')} shows a part file")
 
 
 @phase("catalog")

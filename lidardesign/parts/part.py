@@ -20,15 +20,14 @@ import numpy as np
 from lidardesign.errors import ConfigError
 from lidardesign.numerics import COARSE_SLACK, sphere_exp, sphere_log
 from lidardesign.parts.statements import (
+    TANGENT,
     Even,
     PartFieldOfView,
     PartFile,
-    Pixels,
     Rings,
     Rosette,
     Source,
     Statement,
-    Zones,
     ray_count,
 )
 from lidardesign.sensors.pattern import grid_rows, low_discrepancy
@@ -43,9 +42,9 @@ CONDITIONS = ("reflectance_percent", "illuminance_klux", "detection_percent", "a
 
 def projection_of(pattern: Any, view: PartFieldOfView) -> Projection:
     """The projection of the two angles of a part's field of view: `tangent`, `sphere` or `plane`."""
-    if isinstance(pattern, Pixels):
+    if pattern.kind == "pixels":
         return "plane"
-    if isinstance(pattern, Zones | Rosette) or (isinstance(pattern, Even) and view.shape == "ellipse"):
+    if pattern.kind in TANGENT or (isinstance(pattern, Even) and view.shape == "ellipse"):
         return "tangent"
     return "sphere"
 
@@ -91,7 +90,7 @@ def pattern_directions(pattern: Any, view: PartFieldOfView, rate_hz: float) -> n
         angles_deg = np.stack([np.repeat(across, len(elevations)), np.tile(elevations, pattern.columns)], axis=1)
     else:
         # row by row; pixels are even on a plane
-        spaced = _plane_centres if isinstance(pattern, Pixels) else _cell_centres
+        spaced = _plane_centres if pattern.kind == "pixels" else _cell_centres
         across, up = spaced(left, right, pattern.columns), spaced(bottom, top, pattern.rows)
         angles_deg = np.stack([np.tile(across, len(up)), np.repeat(up, len(across))], axis=1)
     return to_directions(projection_of(pattern, view), np.radians(angles_deg))
@@ -226,7 +225,7 @@ class Part:
     @property
     def beam_rad(self) -> float:
         """The angle of what one ray sees: a zone's, of rectangular ones the mean, or what is stated; 0: unknown."""
-        if isinstance(self.pattern, Zones):
+        if self.pattern.kind == "zones":
             return math.sqrt(math.prod(self.field_of_view_rad) / self.rays)
         return (self.value("divergence_mrad") or 0.0) / 1000
 

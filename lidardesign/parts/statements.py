@@ -119,30 +119,19 @@ class MountingStatement(Statement):
     origin: Text | None = None
 
 
-class _Cells(Statement):
-    """Rows and columns of rays."""
+class Cells(Statement):
+    """Rows and columns of rays.
 
-    kind: str
+    Arguments:
+        kind: `zones` of equal angles, as of a multi-zone ranger: one ray at each zone's centre; `pixels` of a camera
+            behind a lens without distortion: even on its focal plane; `raster`, the steps of a two-dimensional scan,
+            even in azimuth and elevation, at the centres of their cells.
+        columns, rows: How many there are.
+    """
+
+    kind: Literal["zones", "pixels", "raster"]
     columns: Count
     rows: Count
-
-
-class Zones(_Cells):
-    """Zones of equal angles, as of a multi-zone ranger: one ray at each zone's centre."""
-
-    kind: Literal["zones"]
-
-
-class Pixels(_Cells):
-    """Pixels of a camera behind a lens without distortion: even on its focal plane."""
-
-    kind: Literal["pixels"]
-
-
-class Raster(_Cells):
-    """Steps of a two-dimensional scan, even in azimuth and elevation, at the centres of their cells."""
-
-    kind: Literal["raster"]
 
 
 class Rings(Statement):
@@ -188,7 +177,7 @@ class Even(Statement):
     rays: Count
 
 
-Pattern = Annotated[Zones | Pixels | Raster | Rings | Rosette | Even, Field(discriminator="kind")]
+Pattern = Annotated[Cells | Rings | Rosette | Even, Field(discriminator="kind")]
 Values = Annotated[list[Value], Field(min_length=1)]
 Limits = Annotated[list[Limit], Field(min_length=1)]
 Wholes = Annotated[list[Whole], Field(min_length=1)]
@@ -238,6 +227,8 @@ class Figures(_Keys):
 
 FIELDS = tuple(Figures.model_fields)
 REQUIRED = ("pattern", "field_of_view_deg", "far_m", "rate_hz")
+# Patterns whose field of view is in angles from the forward axis.
+TANGENT = ("zones", "rosette")
 STRAIGHT_DEG = 180.0
 RIGHT_DEG = 90.0
 MODE_NAME = r"^[a-z0-9][a-z0-9.-]{0,30}$"
@@ -265,9 +256,9 @@ def check_pattern(pattern: Any, view: PartFieldOfView, rate_hz: float, of_mode: 
     if not 1 <= count <= MOST_RAYS:
         raise ValueError(f"pattern{of_mode} has {count} rays a frame, allowed are 1 to {MOST_RAYS:,}")
     widest = [max(map(abs, interval)) for interval in (view.azimuth, view.elevation)]
-    if isinstance(pattern, Zones | Rosette) and math.hypot(*widest) > STRAIGHT_DEG:
+    if pattern.kind in TANGENT and math.hypot(*widest) > STRAIGHT_DEG:
         raise ValueError(f"field_of_view_deg{of_mode} reaches beyond {STRAIGHT_DEG:g} degrees from the forward axis")
-    if isinstance(pattern, Pixels) and max(widest) >= RIGHT_DEG:
+    if pattern.kind == "pixels" and max(widest) >= RIGHT_DEG:
         raise ValueError(f"field_of_view_deg{of_mode} reaches {RIGHT_DEG:g} degrees, which no flat sensor sees")
     if isinstance(pattern, Rosette):
         reach = sum(pattern.deflection_deg)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -20,7 +19,6 @@ from lidardesign.density.training.checkpoint import (
     clear_snapshots,
     is_snapshot,
     load_arrays,
-    save_arrays,
     snapshot_name,
     stored_snapshots,
 )
@@ -246,7 +244,7 @@ def test_snapshots_are_kept_when_balancing_begins_and_after_each_doubling(pathwi
 
 def moved(trainer, balanced_steps, weights):
     """Let the average follow a flow that is at these weights after so many balancing steps."""
-    trainer.step = trainer.pathwise_steps + balanced_steps
+    trainer.step = trainer.settings.pathwise_steps + balanced_steps
     with torch.no_grad():
         for parameter, value in zip(trainer.flow.parameters(), weights, strict=True):
             parameter.copy_(value)
@@ -260,7 +258,7 @@ def like(trainer, generator):
 
 def test_the_average_is_the_flow_until_balancing_begins_and_after_its_first_step(tmp_path):
     trainer, generator = a_trainer(tmp_path), torch.Generator().manual_seed(0)
-    for step in range(-trainer.pathwise_steps + 1, 2):
+    for step in range(-trainer.settings.pathwise_steps + 1, 2):
         weights = [value.float() for value in like(trainer, generator)]
         for found, expected in zip(moved(trainer, step, weights), weights, strict=True):
             assert torch.equal(found, expected)
@@ -287,16 +285,6 @@ def test_what_is_learned_is_the_average(tmp_path):
     for name, value in learned.items():
         np.testing.assert_array_equal(value, arrays[f"average.{name}"].astype(value.dtype))
     assert any((arrays[f"flow.{name}"] != arrays[f"average.{name}"]).any() for name in learned)
-
-
-def test_a_checkpoint_of_an_earlier_version_is_refused_with_what_to_do(finished, tmp_path):
-    shutil.copytree(finished[0], tmp_path / "run")
-    arrays, state = load_arrays(tmp_path / "run", "checkpoint.safetensors")
-    earlier = {name: value for name, value in arrays.items() if not name.startswith("average.")}
-    del state["stopped"]
-    save_arrays(tmp_path / "run", "checkpoint.safetensors", earlier, state)
-    with pytest.raises(DataError, match=r"(?s)checkpoint.safetensors: is of an earlier version.*learn the run again"):
-        learn(BallTask(), config_of(), tmp_path / "run", resume=True)
 
 
 def test_a_run_lists_its_snapshots_with_their_hashes(finished):

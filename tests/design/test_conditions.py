@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lidardesign.errors import ConfigError, DataError, NumericalError
-from lidardesign.mixture.support import at_condition, conditioned
+from lidardesign.mixture.support import at_condition
 from lidardesign.samples import Samples
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace
 
@@ -167,19 +167,3 @@ WORTH = r"x_m=1 the 1000 nearest samples count as only [0-3]\n(.|\n)*at least 50
 def test_what_cannot_be_moved_to_a_value_is_refused_in_words(samples, condition, target, error, words):
     with pytest.raises(error, match=words):
         at_condition(samples, condition, target, 1000, np.random.default_rng(0))
-
-
-def test_samples_at_a_condition_are_remembered_while_the_run_is():
-    calls = []
-
-    def counted(points):
-        calls.append(len(points))
-        return log_target(points)
-
-    samples = learned(2000, seed=9)
-    one, other = (conditioned(samples, {"x_m": 1.0}, counted) for _ in range(2))
-    assert one is other
-    assert len(calls) == 1
-    assert conditioned(samples, {"x_m": 2.0}, counted) is not one
-    with pytest.raises(ConfigError, match="give --at x_m=VALUE"):
-        conditioned(samples, {}, counted)

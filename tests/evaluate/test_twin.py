@@ -60,7 +60,7 @@ def fit(run, case, visibility):
     generator = random_generator(config.seed, "no visibility")
     scenes, target = run.scenes("train", config.seed), RunTarget(run, visibility)
     samples = samples_without_visibility(scenes, config.space, config.density, SAMPLES, generator)
-    return fit_design(request, samples=samples.retargeted(target(samples.points)), target=target).design
+    return fit_design(request, samples=replace(samples, log_target=target(samples.points)), target=target).design
 
 
 @pytest.fixture(scope="module")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -82,7 +83,7 @@ def weighted(lidardesign, flat):
 @pytest.mark.parametrize("layout", ["even", "chosen"])
 def test_a_setting_that_changes_nothing_changes_no_byte_but_what_says_so(lidardesign, flat, layout):
     samples, designs = load_samples(flat), []
-    save_samples(samples.retargeted(RunTarget(open_run(flat))(samples.points)), flat)
+    save_samples(replace(samples, log_target=RunTarget(open_run(flat))(samples.points)), flat)
     for weights in ((), ("--weight", "variation=1.0")):
         fit = ("fit", flat, "--layout", layout, "--sensors", 2, "--rays", 12, "--name", "same")
         succeeded(lidardesign, *fit, *weights)
@@ -166,7 +167,7 @@ def test_a_density_is_weighted_towards_other_scenes(lidardesign, runs, tmp_path)
     # discs are at x of 0.30 and 0.68 and y of 0.65 and 0.80, each seen from both sides
     target = RunTarget(open_run(run), weighting=Weighting.of(design))
     samples = load_samples(run)
-    samples = samples.retargeted(target(samples.points))
+    samples = replace(samples, log_target=target(samples.points))
     assert (samples.weights[_on_disc(samples.points)].sum()) > 0.9
     found = succeeded(lidardesign, "constrain", run / "designs" / "discs.yaml", "--name", "again")
     assert found["satisfied"]

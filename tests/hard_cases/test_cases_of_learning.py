@@ -132,7 +132,7 @@ class TestSteepSplines:
     def test_steps_go_on_in_float64_where_float32_fails_and_not_before(self, tmp_path):
         trainer = a_trainer(tmp_path)
         trainer._advance()
-        trainer.step = trainer.pathwise_steps
+        trainer.step = trainer.settings.pathwise_steps
         trainer._begin_stretch()
         assert trainer.doubled_at is None
         with torch.no_grad():
@@ -141,9 +141,9 @@ class TestSteepSplines:
         trainer.step = 0
         trainer._begin_stretch()  # no foreign density is asked for yet
         assert trainer.doubled_at is None
-        trainer.step = trainer.pathwise_steps
+        trainer.step = trainer.settings.pathwise_steps
         trainer._begin_stretch()
-        assert trainer.doubled_at == trainer.pathwise_steps
+        assert trainer.doubled_at == trainer.settings.pathwise_steps
         state = [v for one in trainer.optimiser.state.values() for n, v in one.items() if n != "step"]
         assert {p.dtype for p in trainer.flow.parameters()} == {v.dtype for v in state} == {torch.float64}
         trainer._advance()
@@ -332,8 +332,8 @@ class TestModesFarApart:
     def test_annealing_and_balancing_are_on_where_nothing_is_said(self, tmp_path):
         trainer = a_trainer(tmp_path)
         assert trainer.sigma_m(0) == pytest.approx(training.SIGMA_START_RATIO * 0.05)
-        assert trainer.sigma_m(trainer.pathwise_steps) == pytest.approx(0.05)
-        assert 0 < trainer.pathwise_steps < trainer.settings.steps
+        assert trainer.sigma_m(trainer.settings.pathwise_steps) == pytest.approx(0.05)
+        assert 0 < trainer.settings.pathwise_steps < trainer.settings.steps
 
 
 @hard_case(

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.fits import broken, design_of, fitted
 from support.hard_cases import hard_case
-from support.mixtures import POINT, WHOLE, Z, drawn, features_of, random_mixture
+from support.mixtures import POINT, WHOLE, Z, drawn, features_of, random_mixture, taken
 
 from lidardesign.constraints.document import Constraints
 from lidardesign.errors import InfeasibleError
@@ -195,7 +195,7 @@ class TestSamplesFarFromEveryComponent:
         generator = np.random.default_rng(number)
         mixture = random_mixture(generator, 3)
         features = features_of(far_away(mixture, sigmas, generator))
-        alone = np.stack([log_density(mixture.take(np.array([k])), features) for k in range(3)], axis=1)
+        alone = np.stack([log_density(taken(mixture, np.array([k])), features) for k in range(3)], axis=1)
         logs = alone + np.log(mixture.weights)
         expected = np.exp(logs - np.logaddexp.reduce(logs, axis=1)[:, None])
         # exponents of 1e12 keep four digits behind the point
@@ -205,7 +205,7 @@ class TestSamplesFarFromEveryComponent:
     def test_a_ray_opposite_to_every_boresight_stays_finite(self):
         generator = np.random.default_rng(9)
         mixture = random_mixture(generator, 3)
-        same = mixture.take(np.zeros(3, dtype=int))
+        same = taken(mixture, np.zeros(3, dtype=int))
         points = drawn(mixture, 5, generator)
         points[:, 3], points[:, 4] = same.azimuth_rad[0] + math.pi, -same.elevation_rad[0]
         features = features_of(points)

@@ -36,7 +36,6 @@ from lidardesign.density.training.quality import coverage, quality
 from lidardesign.errors import LidardesignError
 from lidardesign.estimates import mean_interval
 from lidardesign.fitting import fit as fit_design
-from lidardesign.mixture.em import lloyd
 from lidardesign.run.manifest import record, start_manifest
 from lidardesign.run.yaml import load_yaml
 from lidardesign.samples import Samples
@@ -181,7 +180,6 @@ GIVEN = {
     "fit_sensors, points": lambda x: fitted(samples_with(x, "points"), sensors=1),
     "fit_sensors, log_prob": lambda x: fitted(samples_with(x, "log_prob"), sensors=1),
     "split_budget": lambda x: split_budget([1.0, x], 10),
-    "lloyd": lambda x: lloyd(np.array([[0.0], [x], [1.0]]), np.ones(3), 2, np.random.default_rng(0)),
     "Constraints": lambda x: Constraints.from_mapping({"gate": {"width_m": {"max": x}}}),
     "mean_interval": lambda x: mean_interval([1.0, x]),
     "checked_score": lambda x: checked_score(scoring(x), ERROR, BALL, simulate(BALL, rays_with(0.0, "origin_m"))),
@@ -207,8 +205,10 @@ class TestNoNaNLeaves:
     def test_figures_of_any_finite_weights_are_finite(self, log_weights, offset):
         log_target = np.array(log_weights)
         found = quality(np.full(len(log_target), offset), log_target)
-        assert all(math.isfinite(value) for value in vars(found).values() if value is not None)
-        covered = coverage(np.zeros(len(log_target)), log_target, np.full(len(log_target), offset), found.log_z)
+        assert all(math.isfinite(number) for one in found.values() for number in (one.value, one.error))
+        covered = coverage(
+            np.zeros(len(log_target)), log_target, np.full(len(log_target), offset), found["log_z"].value
+        )
         assert 0 <= covered.value <= 1
 
     def test_rays_that_meet_nothing_give_a_status_and_no_number(self):

@@ -51,3 +51,9 @@ def drawn(mixture, count, generator, space=WHOLE):
 
 def features_of(points, space=WHOLE, weights=None):
     return Features.of(points, np.ones(len(points)) if weights is None else weights, Axes.of(space), space)
+
+
+def taken(mixture, order):
+    """The components at indices, their weights scaled to sum to 1."""
+    rows = {name: values[order] for name, values in vars(mixture).items()}
+    return Mixture(**{**rows, "weights": rows["weights"] / rows["weights"].sum()})

@@ -290,16 +290,10 @@ def _table_weights(field: TableField, bodies: list[tuple[int, Body]]) -> TableWe
     check_table(field.grid, columns, tables=2)
     meshes = [body.shape.transformed(body.pose()) for _, body in bodies]
     table = np.zeros((field.grid.size, columns), dtype=np.float32)
-    alone = np.bincount([column for column, _ in bodies], minlength=columns) < 2
-    nearest = np.full((field.grid.size, int((~alone).sum())), np.inf, dtype=np.float32)
-    place = np.cumsum(~alone) - 1
+    nearest = np.full(table.shape, np.inf, dtype=np.float32)
     for (column, body), mesh, values in zip(bodies, meshes, cached_log_weight_grids(meshes, field.grid), strict=True):
-        values = values + np.float32(np.log(body.importance))
-        if alone[column]:
-            table[:, column] = values
-            continue
         distances = cached_distance_grids([mesh], field.grid)[0]
-        nearer = distances < nearest[:, place[column]]
-        nearest[nearer, place[column]] = distances[nearer]
-        table[nearer, column] = values[nearer]
+        nearer = distances < nearest[:, column]
+        nearest[nearer, column] = distances[nearer]
+        table[nearer, column] = values[nearer] + np.float32(np.log(body.importance))
     return TableWeights(table, field.grid, field.compiled)

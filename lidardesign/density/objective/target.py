@@ -32,7 +32,7 @@ from lidardesign.errors import ConfigError, NumericalError
 from lidardesign.numerics import SLACK
 from lidardesign.run.clock import phase
 from lidardesign.scenes.scene import Mesh, Scene
-from lidardesign.space import AZIMUTH, DIMENSIONS, ELEVATION, RANGE, DesignSpace, observed_point
+from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, observed_point
 
 PADDING_SIGMAS = 4.0
 MOST_QUADRATURE_BODIES = 2000
@@ -103,8 +103,8 @@ class Target:
     @phase("target")
     def _in_chunks(self, points: np.ndarray, sigma_m: float | None, gradient: bool) -> tuple[np.ndarray, np.ndarray]:
         points = np.asarray(points, dtype=np.float64)
-        if wrong := unusable(points):
-            raise NumericalError(wrong, where="target density")
+        if not np.isfinite(points).all() or points[:, RANGE].min(initial=0.0) < -SLACK:
+            raise NumericalError("design points are not finite, or their range_m is negative", where="target density")
         optics = self.optics if sigma_m is None else self.optics.widened(sigma_m)
         values, gradients = np.empty(len(points)), np.empty((len(points) if gradient else 0, 6))
         size, order = self.rows_at_once, nearby_order(observed_point(points))
@@ -156,16 +156,6 @@ def nearby_order(points: np.ndarray) -> np.ndarray:
         for axis in range(3):
             keys |= ((cells[:, axis] >> level) & 1) << (3 * level + axis)
     return np.argsort(keys, kind="stable")
-
-
-def unusable(points: np.ndarray) -> str | None:
-    """The reason why design points (N, 6) are invalid (not finite, or a negative range), else None."""
-    if np.isfinite(points).all() and points[:, RANGE].min(initial=0.0) >= -SLACK:
-        return None
-    for name, values in zip(DIMENSIONS, points.T, strict=True):
-        if not np.isfinite(values).all():
-            return f"{int((~np.isfinite(values)).sum())} design points are not finite in {name}"
-    return f"range_m is {points[:, RANGE].min():g} m, which is negative"
 
 
 def build_target(

@@ -12,8 +12,9 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import UnionType
 from typing import Any
 
 import numpy as np
@@ -83,43 +84,43 @@ MOMENTS = ("exp_avg", "exp_avg_sq")
 HINT = "resume with the run's own configuration, or learn the run again"
 
 
+def _is_number(value: Any, most: float, kinds: type | UnionType = int | float) -> bool:
+    return isinstance(value, kinds) and not isinstance(value, bool) and 0 <= value <= most
+
+
+def _is_count(value: Any) -> bool:
+    return _is_number(value, MOST_STEPS, int)
+
+
+# What every entry of a state has to be, in words, and whether a value is that.
+ENTRIES: dict[str, tuple[str, Callable[[Any], bool]]] = {
+    **dict.fromkeys(COUNTERS, ("a whole number", _is_count)),
+    "halvings": ("a whole number", lambda value: _is_number(value, MOST_HALVINGS, int)),
+    "doubled_at": ("a whole number", lambda value: value is None or _is_count(value)),
+    "least_misplaced": ("a share from 0 to 1", lambda value: value is None or _is_number(value, 1)),
+    "stopped": ("true or false", lambda value: isinstance(value, bool)),
+    "seconds": ("a number from 0", lambda value: _is_number(value, MOST_SECONDS)),
+}
+
+
 def check_resumable(
-    arrays: Mapping[str, np.ndarray],
-    state: Mapping[str, Any],
-    flow: torch.nn.Module,
-    generator: torch.Generator,
-    path: Path,
+    arrays: Mapping[str, np.ndarray], state: Mapping[str, Any], flow: torch.nn.Module, path: Path
 ) -> None:
     """Refuse a checkpoint that training cannot resume from, although its file is whole.
 
     Arguments:
         arrays, state: Its content.
         flow: The flow whose weights it should have.
-        generator: The random stream whose state it should have.
         path: The file.
 
     Raises:
         DataError: A counter or an array is missing, or is none.
     """
-    if "stopped" not in state:
-        found = "is of an earlier version, which did not average the weights"
-        raise DataError(found, where=str(path), hint="learn the run again, or finish it with the version that began it")
-    for name in (*COUNTERS, "doubled_at"):
-        value = state.get(name)
-        most = MOST_HALVINGS if name == "halvings" else MOST_STEPS
-        whole = isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= most
-        if not whole and not (name == "doubled_at" and value is None):
-            raise DataError(f"has {name} = {value!r}", where=str(path), allowed="a whole number", hint=HINT)
-    least = state.get("least_misplaced")
-    if least is not None and not (isinstance(least, float) and 0 <= least <= 1):
-        raise DataError(f"has least_misplaced = {least!r}", where=str(path), allowed="a share from 0 to 1", hint=HINT)
-    if not isinstance(state["stopped"], bool):
-        raise DataError(f"has stopped = {state['stopped']!r}", where=str(path), allowed="true or false", hint=HINT)
-    seconds = state.get("seconds")
-    if not isinstance(seconds, int | float) or isinstance(seconds, bool) or not 0 <= seconds <= MOST_SECONDS:
-        raise DataError(f"has seconds = {seconds!r}", where=str(path), allowed="a number from 0", hint=HINT)
-    weights = {f"{of}.{name}": value.numel() for of in FLOWS for name, value in flow.state_dict().items()}
-    held = {name: array.size for name, array in arrays.items() if name.partition(".")[0] in FLOWS}
+    for name, (allowed, fits) in ENTRIES.items():
+        if not fits(state.get(name)):
+            raise DataError(f"has {name} = {state.get(name)!r}", where=str(path), allowed=allowed, hint=HINT)
+    weights = {f"{of}.{name}": tuple(value.shape) for of in FLOWS for name, value in flow.state_dict().items()}
+    held = {name: array.shape for name, array in arrays.items() if name.partition(".")[0] in FLOWS}
     if held != weights:
         differing = sorted(name for name in {*held, *weights} if held.get(name) != weights.get(name))
         raise DataError(f"the checkpoint belongs to another flow: {differing[0]} differs", where=str(path), hint=HINT)
@@ -131,18 +132,13 @@ def check_resumable(
         # a weight that no step has moved yet has no moments
         if found and {name: array.shape for name, array in found.items()} != expected:
             raise DataError(f"the checkpoint belongs to another flow: {start[:-1]} differs", where=str(path), hint=HINT)
-        if any(array.dtype.kind != "f" for array in found.values()):
-            raise DataError(f"holds no numbers in {start[:-1]}", where=str(path), hint=HINT)
         # the optimiser takes roots of squares and divides by steps: no negative squares, no moments without a step
         if found and (found[f"{start}exp_avg_sq"].min() < 0 or found[f"{start}step"].min() < 1):
             raise DataError(f"holds impossible numbers in {start[:-1]}", where=str(path), hint=HINT)
-    stream, own = arrays.get("generator"), generator.get_state()
-    if stream is None or stream.dtype != np.uint8 or stream.shape != tuple(own.shape):
-        raise DataError("holds no random stream", where=str(path), hint=HINT)
     try:
-        torch.Generator().set_state(torch.as_tensor(stream.copy()))
-    except RuntimeError as error:
-        raise DataError(f"holds a damaged random stream ({error})", where=str(path), hint=HINT) from None
+        torch.Generator().set_state(torch.as_tensor(arrays["generator"].copy()))
+    except (KeyError, TypeError, RuntimeError) as error:
+        raise DataError(f"holds no random stream ({error})", where=str(path), hint=HINT) from None
 
 
 FOLDER = "snapshots"

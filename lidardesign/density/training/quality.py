@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -51,35 +51,14 @@ from lidardesign.samples import Samples
 COVERED_RATIO = 0.1
 
 
-@dataclass(frozen=True)
-class Quality:
-    """Figures of a learned density against its target, and their standard errors over other samples of the flow.
+def quality(log_prob: np.ndarray, log_target: np.ndarray, groups: np.ndarray | None = None) -> dict[str, Estimate]:
+    """Figures of samples of p, shapes (N,), against their target; with `groups` (one per condition value) their means.
 
-    Arguments:
-        ess: (sum w)^2 / (N sum w^2), 0 to 1.
-        kl_nats: KL(p || p* / Z) = mean(log p - log p*) + log Z [nats].
-        log_z: log of the integral of p* over the chart.
-        ess_error, kl_error_nats, log_z_error: Their standard errors.
-    """
+    Errors are standard errors over other samples of the flow.
 
-    ess: float
-    kl_nats: float
-    log_z: float
-    ess_error: float
-    kl_error_nats: float
-    log_z_error: float
-
-    def estimates(self) -> dict[str, Estimate]:
-        """The figures with their errors by name."""
-        return {
-            "ess": Estimate(self.ess, self.ess_error),
-            "kl_nats": Estimate(self.kl_nats, self.kl_error_nats, "nats"),
-            "log_z": Estimate(self.log_z, self.log_z_error, "nats"),
-        }
-
-
-def quality(log_prob: np.ndarray, log_target: np.ndarray, groups: np.ndarray | None = None) -> Quality:
-    """ESS, KL and log Z of samples of p, shapes (N,); with `groups` (one per condition value) each is averaged.
+    Returns:
+        ess: (sum w)^2 / (N sum w^2), 0 to 1. kl_nats: KL(p || p* / Z) = mean(log p - log p*) + log Z. log_z: log of the
+        integral of p* over the chart.
 
     Raises:
         NumericalError: A log density is NaN or infinite.
@@ -87,13 +66,7 @@ def quality(log_prob: np.ndarray, log_target: np.ndarray, groups: np.ndarray | N
     log_weights = log_target - log_prob
     if not len(log_weights) or not np.isfinite(log_weights).all():
         raise _no_weights(log_weights)
-    if groups is None:
-        return _quality(log_weights)
-    parts = list(quality_by_group(log_weights, groups).values())
-    figures = (np.mean([getattr(part, name) for part in parts]) for name in ("ess", "kl_nats", "log_z"))
-    # groups have samples of their own
-    errors = ([getattr(part, name) for part in parts] for name in ("ess_error", "kl_error_nats", "log_z_error"))
-    return Quality(*map(float, figures), *(float(np.linalg.norm(error)) / len(parts) for error in errors))
+    return _quality(log_weights) if groups is None else _mean(list(quality_by_group(log_weights, groups).values()))
 
 
 def _no_weights(log_weights: np.ndarray) -> NumericalError:
@@ -103,24 +76,31 @@ def _no_weights(log_weights: np.ndarray) -> NumericalError:
     )
 
 
-def quality_by_group(log_weights: np.ndarray, groups: np.ndarray) -> dict[int, Quality]:
+def _mean(parts: list[dict[str, Estimate]]) -> dict[str, Estimate]:
+    """The mean figures of condition groups, which have samples of their own."""
+    means = {}
+    for name, first in parts[0].items():
+        values, errors = [part[name].value for part in parts], [part[name].error for part in parts]
+        means[name] = replace(first, value=float(np.mean(values)), error=float(np.linalg.norm(errors)) / len(parts))
+    return means
+
+
+def quality_by_group(log_weights: np.ndarray, groups: np.ndarray) -> dict[int, dict[str, Estimate]]:
     """The figures of every condition group by its number, from log p* - log p and groups, shapes (N,)."""
     return {int(group): _quality(log_weights[groups == group]) for group in np.unique(groups)}
 
 
-def _quality(log_weights: np.ndarray) -> Quality:
+def _quality(log_weights: np.ndarray) -> dict[str, Estimate]:
     log_count, log_sum = math.log(len(log_weights)), float(logsumexp(log_weights))
-    log_z = log_sum - log_count
+    log_z, ess = log_sum - log_count, math.exp(2 * log_sum - float(logsumexp(2 * log_weights)) - log_count)
     weights, mean = np.exp(log_weights - log_weights.max()), log_weights.mean()
-    return Quality(
-        ess=math.exp(2 * log_sum - float(logsumexp(2 * log_weights)) - log_count),
-        kl_nats=float(log_z - mean),
-        log_z=log_z,
-        ess_error=effective_share_error(weights),
-        # the log of the mean weight less the mean log weight, of the same samples
-        kl_error_nats=standard_error(weights / weights.mean() - 1 - (log_weights - mean)),
-        log_z_error=log_mean_error(weights),
-    )
+    # of the log of the mean weight less the mean log weight, of the same samples
+    kl_error = standard_error(weights / weights.mean() - 1 - (log_weights - mean))
+    return {
+        "ess": Estimate(ess, effective_share_error(weights)),
+        "kl_nats": Estimate(float(log_z - mean), kl_error, "nats"),
+        "log_z": Estimate(log_z, log_mean_error(weights), "nats"),
+    }
 
 
 def coverage(
@@ -149,35 +129,6 @@ LEAST_SHARED = TINY
 LARGEST_NATS = 300.0
 
 
-@dataclass(frozen=True)
-class Overlap:
-    """The distances of a density from its target.
-
-    Arguments:
-        misplaced: The total variation, 0 to 1.
-        error: Its standard error over other samples and other proposals.
-        log_z: log of the target's integral, by the bridge.
-        ess, ess_error: The effective sample size as the proposals see it, 0 to 1, and its standard error.
-        kl_nats, kl_error_nats: KL(pi || p) and its standard error over other proposals.
-    """
-
-    misplaced: float
-    error: float
-    log_z: float
-    ess: float
-    ess_error: float
-    kl_nats: float
-    kl_error_nats: float
-
-    def estimates(self) -> dict[str, Estimate]:
-        """The figures with their errors by name; log Z is taken from samples."""
-        return {
-            "ess": Estimate(self.ess, self.ess_error),
-            "kl_nats": Estimate(self.kl_nats, self.kl_error_nats, "nats"),
-            "misplaced": Estimate(self.misplaced, self.error),
-        }
-
-
 def worse_of(samples: Mapping[str, Estimate], probes: Mapping[str, Estimate]) -> dict[str, Estimate]:
     """The figures of a density from samples and probes, of both sides the lower ESS and the larger KL."""
     ess = min(samples["ess"], probes["ess"], key=lambda estimate: estimate.value)
@@ -185,46 +136,39 @@ def worse_of(samples: Mapping[str, Estimate], probes: Mapping[str, Estimate]) ->
     return {**samples, **probes, "ess": ess, "kl_nats": kl_nats}
 
 
-@dataclass(frozen=True, eq=False)
-class OverlapPoints:
-    """Points of both densities and what is known at them.
+def overlap(
+    at_samples: np.ndarray,
+    at_proposals: np.ndarray,
+    log_weights: np.ndarray,
+    sample_groups: np.ndarray | None = None,
+    proposal_groups: np.ndarray | None = None,
+) -> dict[str, Estimate]:
+    """The distance of a density from its target as proposals see it; with condition groups, their mean.
+
+    Groups are alike in their conditions' share, so the mean over them is that over conditions. Errors are standard
+    errors over other samples and other proposals.
 
     Arguments:
         at_samples: log p* - log p at samples of p, shape (N,); -inf where p* is 0.
         at_proposals: log p* - log p at proposals, shape (M,); +inf where p is 0.
         log_weights: log p* - log q of the proposals, up to a constant, shape (M,).
         sample_groups, proposal_groups: The condition group of each point, shapes (N,) and (M,), or None.
-    """
 
-    at_samples: np.ndarray
-    at_proposals: np.ndarray
-    log_weights: np.ndarray
-    sample_groups: np.ndarray | None = None
-    proposal_groups: np.ndarray | None = None
-
-
-def overlap(sides: OverlapPoints) -> Overlap:
-    """The total variation of a density and its target; with condition groups, their mean.
-
-    Groups are alike in their conditions' share, so the mean over them is that over conditions.
+    Returns:
+        ess: The effective sample size, 0 to 1. kl_nats: KL(pi || p). misplaced: The total variation, 0 to 1.
 
     Raises:
         NumericalError: A value is NaN, or one side has no points of finite weight.
     """
     parts = []
-    for group in [] if sides.sample_groups is None else np.unique(sides.sample_groups):
-        mine, theirs = sides.sample_groups == group, sides.proposal_groups == group
+    for group in [] if sample_groups is None else np.unique(sample_groups):
+        mine, theirs = sample_groups == group, proposal_groups == group
         if min(mine.sum(), theirs.sum()) >= LEAST_POINTS:
-            parts.append(_overlap(sides.at_samples[mine], sides.at_proposals[theirs], sides.log_weights[theirs]))
-    if not parts:
-        return _overlap(sides.at_samples, sides.at_proposals, sides.log_weights)
-    values = {name: [getattr(part, name) for part in parts] for name in Overlap.__annotations__}
-    # groups have points of their own
-    spread = {name: float(np.linalg.norm(values[name])) / len(parts) for name in values if "error" in name}
-    return Overlap(**{name: float(np.mean(values[name])) for name in values} | spread)
+            parts.append(_overlap(at_samples[mine], at_proposals[theirs], log_weights[theirs]))
+    return _mean(parts) if parts else _overlap(at_samples, at_proposals, log_weights)
 
 
-def _overlap(at_samples: np.ndarray, at_proposals: np.ndarray, log_weights: np.ndarray) -> Overlap:
+def _overlap(at_samples: np.ndarray, at_proposals: np.ndarray, log_weights: np.ndarray) -> dict[str, Estimate]:
     if any(np.isnan(values).any() for values in (at_samples, at_proposals, log_weights)):
         raise NumericalError("a density is NaN where it is compared")
     if not np.isfinite(at_samples).any() or not np.isfinite(log_weights).any():
@@ -252,16 +196,14 @@ def _overlap(at_samples: np.ndarray, at_proposals: np.ndarray, log_weights: np.n
     starved_nats = np.clip(at_proposals - log_z, -LARGEST_NATS, LARGEST_NATS)
     ratios = np.exp(starved_nats)
     mean_ratio = float(weights @ ratios)
-    return Overlap(
-        misplaced=1.0 - shared,
-        error=error,
-        log_z=log_z,
-        # rounding of the two sides may take it beyond 1
-        ess=min(1.0 / mean_ratio, 1.0),
-        ess_error=weighted_mean_error(ratios, weights) / mean_ratio**2,
-        kl_nats=max(float(weights @ starved_nats), 0.0),
-        kl_error_nats=weighted_mean_error(starved_nats, weights),
-    )
+    # rounding of the two sides may take the ESS beyond 1
+    ess, ess_error = min(1.0 / mean_ratio, 1.0), weighted_mean_error(ratios, weights) / mean_ratio**2
+    kl_nats, kl_error = max(float(weights @ starved_nats), 0.0), weighted_mean_error(starved_nats, weights)
+    return {
+        "ess": Estimate(ess, ess_error),
+        "kl_nats": Estimate(kl_nats, kl_error, "nats"),
+        "misplaced": Estimate(1.0 - shared, error),
+    }
 
 
 def _bracket(gap: Callable[[float], float], start: float) -> tuple[float, float]:
@@ -339,18 +281,17 @@ def measure(learned: LearnedFlow, probes: IndependentProbes, count: int) -> Meas
     samples = thinning.thinned(samples, learned.generator)
     groups = condition_groups(space, samples.points)
     figures, covered = quality(samples.log_prob, samples.log_target, groups), Estimate(0.0, None)
-    sides = OverlapPoints(samples.log_weights, samples.log_weights, samples.log_weights, groups, groups)
+    sides = samples.log_weights, samples.log_weights, samples.log_weights, groups, groups
     if len(probes.points):
         theirs = condition_groups(space, probes.points)
         log_prob = thinning.log_prob(log_density_of(learned, probes.points), probes.log_target, theirs)
-        log_z = _log_z_at(probes.points, samples, groups, figures.log_z)
+        log_z = _log_z_at(probes.points, samples, groups, figures["log_z"].value)
         covered = coverage(log_prob, probes.log_target, probes.log_proposal, log_z)
         log_weights = probes.log_target - probes.log_proposal
-        sides = OverlapPoints(samples.log_weights, probes.log_target - log_prob, log_weights, groups, theirs)
+        sides = samples.log_weights, probes.log_target - log_prob, log_weights, groups, theirs
     else:
         notes.append(NOT_COVERED)
-    apart = overlap(sides)
-    estimates = worse_of(figures.estimates(), apart.estimates()) | {"coverage": covered}
+    estimates = worse_of(figures, overlap(*sides)) | {"coverage": covered}
     off = round_trip_nats(learned.flow, ROUND_TRIPS, torch.Generator().manual_seed(0))
     if off > TOLERANCE_NATS:
         notes.append(
@@ -366,7 +307,7 @@ def _log_z_at(points: np.ndarray, samples: Samples, groups: np.ndarray | None, m
         return mean_log_z
     by_group = np.full(CONDITION_GROUPS, mean_log_z)
     for group, part in quality_by_group(samples.log_weights, groups).items():
-        by_group[group] = part.log_z
+        by_group[group] = part["log_z"].value
     return by_group[condition_groups(samples.space, points)]
 
 

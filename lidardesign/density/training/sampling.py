@@ -91,11 +91,9 @@ class Thinning:
             log_weights: log p* - log p, shape (N,).
             groups: Their condition groups, shape (N,), where there are conditions.
         """
-        parts = [log_weights]
-        if groups is not None:
-            parts = [log_weights[groups == n] for n in range(CONDITION_GROUPS)]
-            # a group without finite weights is thinned as all of them
-            parts = [part if np.isfinite(part).any() else log_weights for part in parts]
+        parts = [log_weights] if groups is None else [log_weights[groups == n] for n in range(CONDITION_GROUPS)]
+        # a group without finite weights is thinned as all of them
+        parts = [part if np.isfinite(part).any() else log_weights for part in parts]
         log_least = [_log_mean(part) for part in parts]
         if groups is not None:
             log_least = [_log_least(part, most) for part, most in zip(parts, log_least, strict=True)]

@@ -52,7 +52,7 @@ from lidardesign.density.training.checkpoint import (
 from lidardesign.density.training.losses import TOLERANCE_NATS, Pool, balancing_loss, pathwise_loss, round_trip_nats
 from lidardesign.density.training.quality import IndependentProbes, measure
 from lidardesign.density.training.sampling import LearnedFlow
-from lidardesign.errors import DataError, DivergenceError, NumericalError
+from lidardesign.errors import DivergenceError, NumericalError
 from lidardesign.estimates import Estimate
 from lidardesign.numerics import HALF_DIGITS
 from lidardesign.run.clock import phase
@@ -213,14 +213,9 @@ class Trainer(LearnedFlow):
         return self.seconds_before + time.perf_counter() - self._started
 
     @property
-    def pathwise_steps(self) -> int:
-        """Steps before balancing begins."""
-        return self.settings.pathwise_steps
-
-    @property
     def balanced_steps(self) -> int:
         """Balancing steps that are done; negative before they begin."""
-        return self.step - self.pathwise_steps
+        return self.step - self.settings.pathwise_steps
 
     def learned(self) -> LearnedFlow:
         """The learned flow in float64: the best average that was measured, else the last one.
@@ -237,13 +232,13 @@ class Trainer(LearnedFlow):
         """The annealed sigma of a step [m]."""
         final = self.target.optics.sigma_m
         start = max(self.settings.sigma_start_m or SIGMA_START_RATIO * final, final)
-        fraction = min(step / max(ANNEALED * self.pathwise_steps, 1.0), 1.0)
+        fraction = min(step / max(ANNEALED * self.settings.pathwise_steps, 1.0), 1.0)
         return start * (final / start) ** fraction
 
     def _rate(self) -> float:
         share = BALANCING_RATE / math.sqrt(1 + max(self.balanced_steps, 0) / SLOWING_STEPS)
-        if self.step < self.pathwise_steps:
-            cosine = math.cos(math.pi * self.step / self.pathwise_steps)
+        if self.step < self.settings.pathwise_steps:
+            cosine = math.cos(math.pi * self.step / self.settings.pathwise_steps)
             share = LAST_PATHWISE_RATE + (1 - LAST_PATHWISE_RATE) * (1 + cosine) / 2
         return self.settings.rate * share / 2**self.halvings
 
@@ -267,7 +262,9 @@ class Trainer(LearnedFlow):
                     save_flow(self.average, self.run, snapshot_name(self.step), step=self.step)
                 is_last = self._is_over() or self.step == self.settings.steps
                 reached = self._reached(is_last)
-                self.stopped = self._is_good_enough(reached) or (is_last and self.step < self.settings.steps)
+                goal = self.settings.misplaced
+                is_good = bool(reached and goal) and reaches(self.measured[-1][1], goal)
+                self.stopped = is_good or (is_last and self.step < self.settings.steps)
                 if reached or self.stopped or is_last or self.step % PROGRESS_STEPS == 0:
                     self._report(loss, ess, reached, progress)
         except KeyboardInterrupt:
@@ -294,13 +291,9 @@ class Trainer(LearnedFlow):
         self.measured.append((self.step, found))
         return {"misplaced": found.value, "misplaced_error": found.error or 0.0}
 
-    def _is_good_enough(self, reached: Mapping[str, float]) -> bool:
-        goal = self.settings.misplaced
-        return bool(reached and goal) and reaches(self.measured[-1][1], goal)
-
     @property
     def _may_stop(self) -> bool:
-        return self.balanced_steps >= least_balancing_steps(self.pathwise_steps)
+        return self.balanced_steps >= least_balancing_steps(self.settings.pathwise_steps)
 
     def _is_over(self) -> bool:
         return self.is_over is not None and self._may_stop and self.is_over(self)
@@ -361,9 +354,9 @@ class Trainer(LearnedFlow):
     def _loss(self) -> tuple[torch.Tensor, float, float]:
         count = self.settings.batch
         try:
-            if self.step >= self.pathwise_steps:
+            if self.step >= self.settings.pathwise_steps:
                 return balancing_loss(self.flow, self.target, self.coordinates, count, self.pool, self.generator)
-            eta = self.settings.entropy * (1 - self.step / self.pathwise_steps)
+            eta = self.settings.entropy * (1 - self.step / self.settings.pathwise_steps)
             sigma_m, target = self.sigma_m(self.step), self._few_frames()
             return pathwise_loss(self.flow, target, self.coordinates, count, sigma_m, eta, self.generator)
         except NumericalError:  # the flow left the numbers: a step to skip like any other
@@ -375,16 +368,12 @@ class Trainer(LearnedFlow):
         They are taken in float64 where float32 densities are too inaccurate, and proposals that the flow starves are
         drawn more often.
         """
-        if self.step < self.pathwise_steps:
+        if self.step < self.settings.pathwise_steps:
             return
-        self._check_round_trip()
-        self.pool = self.pool.emphasised(self.flow, self.coordinates)
-
-    def _check_round_trip(self) -> None:
-        if next(self.flow.parameters()).dtype == torch.float64:
-            return
-        if round_trip_nats(self.flow, ROUND_TRIPS, torch.Generator().manual_seed(self.step)) > TOLERANCE_NATS:
+        single, stream = next(self.flow.parameters()).dtype != torch.float64, torch.Generator().manual_seed(self.step)
+        if single and round_trip_nats(self.flow, ROUND_TRIPS, stream) > TOLERANCE_NATS:
             self._double(self.step)
+        self.pool = self.pool.emphasised(self.flow, self.coordinates)
 
     def _double(self, step: int) -> None:
         self.doubled_at = step
@@ -431,20 +420,10 @@ class Trainer(LearnedFlow):
         return arrays
 
     def _restore_arrays(self, arrays: dict[str, np.ndarray]) -> None:
-        try:
-            for of in FLOWS:
-                start = f"{of}."
-                weights = {key[len(start) :]: torch.as_tensor(v) for key, v in arrays.items() if key.startswith(start)}
-                getattr(self, of).load_state_dict(weights)
-        except RuntimeError as error:
-            raise DataError(
-                f"the checkpoint belongs to another flow: {str(error).splitlines()[-1].strip()}",
-                where=str(self.run / CHECKPOINT),
-                hint="resume with the run's own configuration",
-            ) from None
+        for of in FLOWS:
+            getattr(self, of).load_state_dict(_inside(arrays, of))
         for index, parameter in enumerate(self.flow.parameters()):
-            start = f"adam.{index}."
-            moments = {key[len(start) :]: torch.as_tensor(v) for key, v in arrays.items() if key.startswith(start)}
+            moments = _inside(arrays, f"adam.{index}")
             self.optimiser.state[parameter] = {name: _moved(name, value, parameter) for name, value in moments.items()}
 
     def _state(self) -> _State:
@@ -459,7 +438,7 @@ class Trainer(LearnedFlow):
     def resume(self) -> None:
         """Take the state of the run's checkpoint; progress.jsonl and snapshots are cut back to it."""
         arrays, state = load_arrays(self.run, CHECKPOINT)
-        check_resumable(arrays, state, self.flow, self.generator, self.run / CHECKPOINT)
+        check_resumable(arrays, state, self.flow, self.run / CHECKPOINT)
         if state.get("doubled_at") is not None:
             self._double(state["doubled_at"])
         self._restore_arrays(arrays)
@@ -475,6 +454,12 @@ class Trainer(LearnedFlow):
             write_atomic(path, "".join(line + "\n" for line in lines))
             rows = [row for row in map(json.loads, lines) if "misplaced" in row]
             self.measured = [(row["step"], Estimate(row["misplaced"], row["misplaced_error"])) for row in rows]
+
+
+def _inside(arrays: Mapping[str, np.ndarray], folder: str) -> dict[str, torch.Tensor]:
+    """The arrays named folder.NAME, by NAME."""
+    names = {key: key.removeprefix(f"{folder}.") for key in arrays}
+    return {name: torch.as_tensor(arrays[key]) for key, name in names.items() if name != key}
 
 
 def _moved(name: str, value: torch.Tensor, parameter: torch.Tensor) -> torch.Tensor:
