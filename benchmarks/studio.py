@@ -63,10 +63,10 @@ def resident_mib() -> float:
 
 def main() -> None:
     """Measure and print."""
-    options = parser(__doc__, rounds=50)
-    options.add_argument("run")
-    options.add_argument("--rays", type=int, default=600)
-    options = options.parse_args()
+    made = parser(__doc__, rounds=50)
+    made.add_argument("run", help="a run folder")
+    made.add_argument("--rays", type=int, default=600, help="rays per frame (default %(default)s)")
+    options = made.parse_args()
 
     from lidardesign.api.run import open_run
     from lidardesign.api.training_scores import TrainingScores
@@ -119,8 +119,9 @@ def main() -> None:
         ["release to score [ms]", 1e3 * statistics.median(scored)],
         ["memory beside the run's own [MiB]", page_mib],
     ]
-    report(options, f"{options.rays} rays, {sum(len(getattr(b.shape, 'faces', ())) for b in scene.bodies)} triangles",
-           ["what", "median"], rows)  # fmt: skip
+    triangles = sum(len(getattr(body.shape, "faces", ())) for body in scene.bodies)
+    caption = f"{options.rays} rays, {triangles} triangles, medians of {options.rounds}"
+    report("The studio's answers", {caption: (["what", "median"], rows)}, path=options.json)
 
 
 if __name__ == "__main__":

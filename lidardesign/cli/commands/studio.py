@@ -29,7 +29,12 @@ def studio(
     quiet: options.Quiet = False,
     verbose: options.Verbose = False,
 ) -> None:
-    """Move sensors on a page and see what they are worth; Ctrl-C ends it."""
+    """Move sensors on a page and see what they are worth.
+
+    Click the ball of a sensor and drag its handle, or type its place and angles: what you move stays there. Fit chooses
+    all the rest again, within the limits; a score on training scenes follows every change. Score judges on held-out
+    scenes. Ctrl-C ends the page.
+    """
     with command(json=False, quiet=quiet, verbose=verbose) as output:
         with phase("libraries"):
             from lidardesign.api.run import load_design, open_run
