@@ -19,6 +19,8 @@ from lidardesign.sensors.bandwidth import split_budget
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import save_design
 from lidardesign.sensors.pattern import Pattern, even_rays
+from lidardesign.sensors.sensor import boresight_frame
+from lidardesign.space import DIMENSIONS, direction
 
 EVEN = DesignSpec("d", three_sensors())
 TURN = 0.7
@@ -249,3 +251,38 @@ def test_exporting_where_a_pattern_does_not_go_writes_nothing(lidardesign, tmp_p
     assert result.code == 2, result.err
     assert "--at" in result.err
     assert [path.name for path in tmp_path.iterdir()] == ["along.yaml"]
+
+
+# --- a sensor at another pose
+
+
+@given(patterns(sensors=3), st.integers(0, 2), st.tuples(*[st.floats(-3, 3)] * 6))
+def test_the_rays_of_a_sensor_go_with_it_and_come_back_with_it(pattern, index, numbers):
+    design = replace(EVEN, layout="chosen", patterns=(pattern,))
+    old, place, frame = design.sensors[index], np.array(numbers[:3]), boresight_frame(*numbers[3:])
+    moved = design.remounted(index, place, frame)
+    new = moved.sensors[index]
+    np.testing.assert_allclose(new.frame, frame, atol=1e-9)
+    own = pattern.sensor == index
+    for value in pattern.ends if pattern.dimension else (None,):
+        before, after = pattern.at(value), moved.patterns[0].at(value)
+        along = [] if pattern.dimension is None else [DIMENSIONS.index(pattern.dimension)]
+        fixed_place = np.where(np.isin(np.arange(3), along), before.origin_m[0], place)
+        # in the sensor's own axes every ray starts and looks as before
+        start = (before.origin_m - np.where(np.isin(np.arange(3), along), before.origin_m[0], old.origin_m))[own]
+        if not along:
+            np.testing.assert_allclose((after.origin_m[own] - fixed_place) @ frame.T, start @ old.frame.T, atol=1e-6)
+        np.testing.assert_allclose(after.direction[own] @ frame.T, before.direction[own] @ old.frame.T, atol=1e-9)
+        np.testing.assert_array_equal(after.gate_m, before.gate_m)
+        for name in ("origin_m", "direction"):
+            np.testing.assert_array_equal(getattr(after, name)[~own], getattr(before, name)[~own])
+    back = moved.remounted(index, old.origin_m, old.frame)
+    assert_near(back.patterns[0], pattern)
+
+
+def assert_near(found, expected):
+    np.testing.assert_allclose(found.origin_m, expected.origin_m, atol=1e-6)
+    np.testing.assert_allclose(
+        direction(found.azimuth_rad, found.elevation_rad), direction(expected.azimuth_rad, expected.elevation_rad),
+        atol=1e-9,
+    )  # fmt: skip

@@ -226,7 +226,6 @@ class TestNumbersOfParts:
         ({"parts": ["vl53l8cx"], "sensors": 1, "layout": "even"}, "parts in the layout even"),
         ({"parts": ["vl53l8cx"], "sensors": 1, "gates": "ray"}, "with gates"),
         ({"parts": [str(Path(__file__).parent)], "sensors": 1}, "holds no file"),
-        ({"parts": ["vl53l8cx"], "sensors": 1, "constraints": {"each": [{"gate": {"width_m": {"max": 1}}}]}}, "each"),
         (
             {"sensors": 1, "constraints": {"parts": {"names": ["vl53l8cx"], "each": {"vl53l5cx": {"max": 1}}}}},
             "'vl53l5cx' is not one of the parts",
@@ -326,3 +325,18 @@ def test_the_zones_of_a_part_fill_its_field():
             assert part.beam_rad**2 * part.rays == pytest.approx(math.prod(part.field_of_view_rad))
         elif part.value("divergence_mrad") is None:
             assert part.beam_rad == 0
+
+
+def test_a_part_keeps_its_own_entry_of_each_and_the_others_the_common_rules(run):
+    aim = math.degrees(bought(run).sensors[0].azimuth_rad) + 3
+    entry = {"boresight": {"azimuth_deg": {"min": aim, "max": aim}}}
+    for number in range(3):
+        spec = bought(run, sensors=3, each=[*[{}] * number, entry])
+        assert math.degrees(spec.sensors[number].azimuth_rad) == pytest.approx(aim % 360, abs=1e-6)
+    away = {"boresight": {"azimuth_deg": {"min": aim + 180, "max": aim + 180}}}
+    for entry, words in (
+        (away, r"each\[0\] wants|azimuth"),
+        ({"gate": {"width_m": {"max": 0.1}}}, "no part satisfies"),
+    ):
+        with pytest.raises(InfeasibleError, match=words):
+            bought(run, each=[entry])
