@@ -27,7 +27,7 @@ MAXIMUM_LAYERS = 16
 CROSSINGS_PER_RAY = 2  # of primitives, allocated at first
 RAYS_AT_ONCE = 100_000  # over frames that are traced together
 
-Only = Literal["all", "targets", "occluders"]
+Only = Literal["all", "targets", "occluders", "resting"]
 
 
 class SceneCaster:
@@ -194,8 +194,8 @@ def trace_each(
 
 
 def _chosen(scene: Scene, only: Only) -> list[tuple[int, Body]]:
-    keep = {"all": lambda body: True, "targets": lambda body: body.is_target, "occluders": lambda b: b.is_occluder}
-    return [(i, body) for i, body in enumerate(scene.bodies) if keep[only](body)]
+    attribute = {"targets": "is_target", "occluders": "is_occluder", "resting": "is_resting"}.get(only)
+    return [(i, body) for i, body in enumerate(scene.bodies) if attribute is None or getattr(body, attribute)]
 
 
 _casters: WeakKeyDictionary[Scene, dict[tuple[int, ...], SceneCaster]] = WeakKeyDictionary()

@@ -340,6 +340,11 @@ class Body:
         """True if it blocks rays in the density."""
         return self.role != "target"
 
+    @property
+    def is_resting(self) -> bool:
+        """True if it has one pose and no velocity."""
+        return self.poses.ndim == 2 and not any(self.velocity_m_s)
+
     def pose(self, frame: int = 0) -> np.ndarray:
         """Pose (4, 4) at a frame; a body at rest has the same one in all frames."""
         return self.poses if self.poses.ndim == 2 else self.poses[frame]

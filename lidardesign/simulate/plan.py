@@ -235,9 +235,8 @@ class Planner:
         Raises:
             ConfigError: An effect that was named cannot be simulated here, or a gate lies outside the histogram.
         """
-        if self.detector.bins is not None or self.detector.photons is not None:
-            for rays in lists:
-                check_windows(path_windows(rays, scene.receiver), self.detector)
+        for rays in lists:
+            check_windows(path_windows(rays, scene.receiver), self.detector)
         found = _bounds(scene, lists, self.detector, casters)
         rays = sum(len(rays) for rays in lists) * scene.frames
         return self._decided(found, {name: predicted_seconds(name, self.detector, rays) for name in EFFECTS})
@@ -254,7 +253,7 @@ class Planner:
                 # counted echoes mix in another way than uncounted ones
                 wanted.add(max(COUNTED, key=lambda name: (found[name].relative(self.tolerated), name)))
         elif self.choice == "all":
-            wanted = available_effects(self.detector)
+            wanted = frozenset(EFFECTS) - ({"motion"} if motion.is_instant(self.detector) else set())
         else:
             wanted = frozenset() if self.choice == "none" else self.choice
         missing = {name: transport.missing() if name == "multipath" else None for name in sorted(wanted)}
@@ -295,11 +294,6 @@ def parse_effects(text: str) -> Choice:
                 hint=suggest(name.lower(), [*EFFECTS, *WORDS]),
             )
     return frozenset(names)
-
-
-def available_effects(detector: Detector) -> frozenset[str]:
-    """Names of the effects that apply to a detector."""
-    return frozenset(EFFECTS) - ({"motion"} if motion.is_instant(detector) else set())
 
 
 def _called_for(found: dict[str, Bound], tolerance: Tolerance) -> set[str]:

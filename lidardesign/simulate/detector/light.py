@@ -7,15 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Self
 
 import numpy as np
 
 from lidardesign.scenes.rays import Hits, Rays
 from lidardesign.scenes.scene import Ambient, Scene
-
-if TYPE_CHECKING:
-    from typing import Self
 
 # First hits of rays (N, 3), (N, 3) that are sent at times (N,) [s] within the frame.
 Tracer = Callable[[np.ndarray, np.ndarray, np.ndarray], Hits]
@@ -93,6 +90,11 @@ class Background:
     per_metre: np.ndarray
     edges_m: np.ndarray | None = None
     counts: np.ndarray | None = None
+
+
+def reflectances(scene: Scene, hits: Hits) -> np.ndarray:
+    """Reflectance at each hit, 0 where there is none, shape (N,)."""
+    return np.array([*(body.reflectance for body in scene.bodies), 0.0])[hits.body]
 
 
 def direct_echoes(scene: Scene, beams: Beams, hits: Hits) -> Echoes:
