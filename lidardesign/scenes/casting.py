@@ -50,11 +50,6 @@ class SceneCaster:
         primitives = [(i, body) for i, body in chosen if not isinstance(body.shape, Mesh)]
         self.primitives = Primitives(primitives, frame) if primitives else None
 
-    @property
-    def resting(self) -> _AtRest | None:
-        """The meshes at rest, or None if there are other shapes too."""
-        return None if self.primitives or self.moving else self.at_rest
-
     def first_hit(self, origins: np.ndarray, directions: np.ndarray) -> Hits:
         """First hits of rays, origins and directions of shape (N, 3); directions are normalised here.
 
@@ -160,7 +155,7 @@ def trace_each(
     Rays and hits are as in `SceneCaster.trace`. Casters of meshes at rest alone, which are many in learning, run only
     Embree's calls one by one.
     """
-    resting = [caster.resting for caster in casters]
+    resting = [None if caster.primitives or caster.moving else caster.at_rest for caster in casters]
     if any(meshes is None for meshes in resting):
         parts = [
             caster.trace(origins[begin:end], directions[begin:end], limit_m[begin:end])

@@ -276,23 +276,13 @@ def parse_effects(text: str) -> Choice:
         ConfigError: An unknown effect; all are listed.
     """
     names = [name.strip() for name in text.split(",")]
-    allowed = f"{', '.join(WORDS)}, or any of {', '.join(EFFECTS)}"
     if names[0] in CHOICES and len(names) == 1:
         return names[0]  # type: ignore[return-value]
-    if not all(names):
-        raise ConfigError(f"{text!r} has an empty effect name", where="--effects", allowed=allowed)
     for name in names:
-        if name in WORDS:
-            raise ConfigError(
-                f"{name!r} cannot be combined with effects", where="--effects", allowed=f"{name} alone, or names"
-            )
         if name not in EFFECTS:
-            raise ConfigError(
-                f"unknown effect {name!r}",
-                where="--effects",
-                allowed=allowed,
-                hint=suggest(name.lower(), [*EFFECTS, *WORDS]),
-            )
+            allowed = f"one of {', '.join(WORDS)} alone, or any of {', '.join(EFFECTS)}"
+            hint = None if name in WORDS else suggest(name.lower(), [*EFFECTS, *WORDS])
+            raise ConfigError(f"unknown effect {name!r}", where="--effects", allowed=allowed, hint=hint)
     return frozenset(names)
 
 

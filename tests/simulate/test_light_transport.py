@@ -80,7 +80,7 @@ def single_bounces(scene: Scene, rays: Rays) -> Echoes:
     caster, beams = shared_caster(scene, 0), Beams.of(rays)
     hits = caster.first_hit(rays.origin_m, rays.direction)
     echoes = direct_echoes(scene, beams, hits)
-    return visible_echoes(scene, beams, hits, echoes, still_tracer(caster))
+    return echoes if scene.receiver is None else visible_echoes(scene, beams, hits, echoes, still_tracer(caster))
 
 
 def histogram(path_m: np.ndarray, weight: np.ndarray, bins: PathBins) -> np.ndarray:

@@ -5,33 +5,16 @@ Beams and echoes are flat lists with the index of each entry's ray, so that a ra
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 
-from lidardesign.scenes.rays import Hits, Rays
+from lidardesign.scenes.rays import Columns, Hits, Rays
 from lidardesign.scenes.scene import Ambient, Scene
 
 # First hits of rays (N, 3), (N, 3) that are sent at times (N,) [s] within the frame.
 Tracer = Callable[[np.ndarray, np.ndarray, np.ndarray], Hits]
-
-
-class Columns:
-    """Flat lists side by side, as a dataclass that holds arrays of one length alone."""
-
-    def __len__(self) -> int:
-        return len(self.ray)
-
-    def subset(self, chosen: np.ndarray | slice) -> Self:
-        """The rows at an index or mask."""
-        return type(self)(*(column[chosen] for column in vars(self).values()))
-
-    @classmethod
-    def joined(cls, parts: Sequence[Self]) -> Self:
-        """Several lists as one, one after the other."""
-        return cls(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
 
 
 @dataclass(frozen=True, eq=False)

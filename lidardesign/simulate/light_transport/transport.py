@@ -377,10 +377,8 @@ def missing() -> str | None:
         if tuple(int(part) for part in re.findall(r"\d+", found)[:2]) < oldest:
             return f"{name} {found} is too old: {'.'.join(map(str, oldest))} or newer is needed"
     if llvm_library() is None:
-        named = os.environ.get(LLVM_VARIABLE)
-        if named:
-            return f"{LLVM_VARIABLE} names {named}, which is not an LLVM library of version {OLDEST_LLVM} or newer"
-        return f"no LLVM library of version {OLDEST_LLVM} or newer was found"
+        place = os.environ.get(LLVM_VARIABLE) or "where systems have it"
+        return f"no LLVM library of version {OLDEST_LLVM} or newer: {place}"
     return None
 
 
