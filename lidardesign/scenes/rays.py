@@ -42,7 +42,7 @@ class Outcome(IntEnum):
     NOT_DETECTED = 4
 
 
-class Columns:
+class FlatLists:
     """Flat lists side by side, as a dataclass that holds arrays of one length alone, or None for some."""
 
     def __len__(self) -> int:
@@ -59,7 +59,7 @@ class Columns:
 
 
 @dataclass(frozen=True, eq=False)
-class Rays(Columns):
+class Rays(FlatLists):
     """An explicit list of rays, in the order in which they fire.
 
     Arguments:
@@ -190,7 +190,7 @@ class Returns:
 
 
 @dataclass(frozen=True, eq=False)
-class Hits(Columns):
+class Hits(FlatLists):
     """First hits of N rays.
 
     Arguments:

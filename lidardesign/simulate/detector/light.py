@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidardesign.scenes.rays import Columns, Hits, Rays
+from lidardesign.scenes.rays import FlatLists, Hits, Rays
 from lidardesign.scenes.scene import Ambient, Scene
 
 # First hits of rays (N, 3), (N, 3) that are sent at times (N,) [s] within the frame.
@@ -18,7 +18,7 @@ Tracer = Callable[[np.ndarray, np.ndarray, np.ndarray], Hits]
 
 
 @dataclass(frozen=True, eq=False)
-class Beams(Columns):
+class Beams(FlatLists):
     """Thin beams of light, B of them.
 
     Arguments:
@@ -43,7 +43,7 @@ class Beams(Columns):
 
 
 @dataclass(frozen=True, eq=False)
-class Echoes(Columns):
+class Echoes(FlatLists):
     """Light that comes back, E echoes.
 
     Arguments:
