@@ -207,7 +207,12 @@ class Fitter:
                 # scenes weigh their items by the same settings
                 config = with_task_settings(run.task, run.config, settings, option=request.weighting.origin)
                 run = replace(run, config=config)
-            self.samples = self._at(loaded)
+            if request.at:
+                generator = random_generator(request.seed, "condition")
+                loaded = at_condition(loaded, request.at, self.target, MOVED_SAMPLES, generator)
+                ess = loaded.effective_sample_size
+                notes(BackgroundNote(f"at {condition_text(request.at)} {len(loaded)} samples have ESS {ess:.2f}"))
+            self.samples = loaded
         # scenes are judged from where the design is
         seen = with_task_settings(run.task, run.config, request.settings) if request.settings else run.config
         here = replace(seen, space=run.config.space.at(request.at))
@@ -226,16 +231,6 @@ class Fitter:
                 allowed=f"at least {LEAST_SAMPLES}",
                 hint=hint,
             )
-
-    def _at(self, samples: Samples) -> Samples:
-        """The samples at the condition values that the design is for."""
-        at, seed = self.request.at, self.request.seed
-        if not at:
-            return samples
-        moved = at_condition(samples, at, self.target, MOVED_SAMPLES, random_generator(seed, "condition"))
-        ess = moved.effective_sample_size
-        self.notes(BackgroundNote(f"at {condition_text(at)} {len(moved)} samples have ESS {ess:.2f}"))
-        return moved
 
     @cached_property
     def scenes(self) -> HeldBackScenes:

@@ -139,7 +139,7 @@ def check_layout(layout: LayoutName, constraints: Constraints, run: RunFolder, o
             layout == "spinning" and isinstance(options.sensors, str)
         ),
     }
-    _refuse_first(faults)
+    refuse_first(faults)
 
 
 def check_goal(layout: LayoutName, constraints: Constraints, run: RunFolder, options: FitOptions) -> None:
@@ -163,7 +163,7 @@ def check_goal(layout: LayoutName, constraints: Constraints, run: RunFolder, opt
             least == "sensors" and isinstance(options.sensors, int)
         ),
     }
-    _refuse_first(faults)
+    refuse_first(faults)
     if goal is not None:
         low, high = metric.limits
         is_number = isinstance(goal, Real) and not isinstance(goal, bool)
@@ -172,7 +172,12 @@ def check_goal(layout: LayoutName, constraints: Constraints, run: RunFolder, opt
             raise ConfigError(f"{goal!r} as {metric.name}", where="--goal", allowed=allowed)
 
 
-def _refuse_first(faults: Mapping[tuple[str, str, str], bool]) -> None:
+def refuse_first(faults: Mapping[tuple[str, str, str], object]) -> None:
+    """Refuse the first fault that is found, of a fault, the option and what is allowed.
+
+    Raises:
+        ConfigError: There is one.
+    """
     for (fault, where, allowed), is_found in faults.items():
         if is_found:
             raise ConfigError(fault, where=where, allowed=allowed)

@@ -150,22 +150,25 @@ def _restrict(coverage: Coverage, rows: np.ndarray) -> Coverage:
     return coverage if len(rows) == coverage.shape[0] else coverage.grouped(rows[:, None])
 
 
-def _known(coverage: Coverage, chosen: Sequence[int]) -> np.ndarray:
+def _gate(coverage: Coverage, chosen: Sequence[int]) -> np.ndarray:
+    """A set as a choice of gates: 0 of its members, -1 of others, (M,)."""
     gate = np.full(coverage.shape[0], -1)
     gate[list(chosen)] = 0
-    return coverage.known(gate)
+    return gate
 
 
 def value_of(coverage: Coverage, chosen: Sequence[int]) -> float:
     """F of a set."""
-    return float(coverage.weight @ coverage.counted(_known(coverage, chosen)))
+    return coverage.value_of(_gate(coverage, chosen))
 
 
 def _filled(coverage: Coverage, limits: SetLimits, chosen: Sequence[int]) -> tuple[int, ...]:
     """A set filled greedily with the candidate of the largest gain, until none gains."""
     chosen = tuple(chosen)
     while len(chosen) < limits.count:
-        gains = np.where(limits.may_join(chosen, coverage.shape[0]), coverage.gains(_known(coverage, chosen))[:, 0], 0)
+        gains = np.where(
+            limits.may_join(chosen, coverage.shape[0]), coverage.gains(coverage.known(_gate(coverage, chosen)))[:, 0], 0
+        )
         best = int(gains.argmax())
         if gains[best] <= 0:
             break
@@ -218,8 +221,7 @@ class _Sets:
 
 def _bounds(coverage: Coverage, limits: SetLimits, chosen: np.ndarray, value: float) -> tuple[float, np.ndarray]:
     """Upper bounds of F over all sets, and over the sets with each of the candidates, (M,)."""
-    gate = np.full(coverage.shape[0], -1)
-    gate[chosen] = 0
+    gate = _gate(coverage, chosen)
     sets = _Sets(limits, len(gate))
     steps = Tangents if len(coverage.table) else Thresholds
     search = steps(coverage, sets, Choice(gate, value, 0.0, 0.0, 0.0))
@@ -245,7 +247,7 @@ def _searched(coverage: Coverage, limits: SetLimits, value: float) -> tuple[tupl
         visits -= 1
         if visits < 0:
             return best, False
-        known = _known(coverage, chosen)
+        known = coverage.known(_gate(coverage, chosen))
         may = limits.may_join(chosen, candidates)
         gains = np.where(may, coverage.gains(known)[:, 0], 0.0)[order]
         gains[:first] = 0.0

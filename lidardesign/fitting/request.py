@@ -21,7 +21,7 @@ from lidardesign.constraints.document import Constraints, load_constraints
 from lidardesign.constraints.origins import is_mounted, origin_box, snap_to_space
 from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.estimates import Estimate, as_documents
-from lidardesign.fitting.options import BEST, LEAST, FitOptions, check_goal, check_layout
+from lidardesign.fitting.options import BEST, LEAST, FitOptions, check_goal, check_layout, refuse_first
 from lidardesign.formats.designs import reach_of, read_design
 from lidardesign.formats.rig import moved_notes, rig_constraints, rig_notes
 from lidardesign.mixture.fit import FittedSensors
@@ -336,11 +336,8 @@ def _with_parts(options: FitOptions, asked: Constraints | None, run: RunFolder) 
         "parts with --gates: a part's gates are fixed": options.gates,
         f"the task {run.task.name} has no method informs": not informs_rays(run.task),
     }
-    for fault, is_found in lacking.items():
-        if is_found:
-            raise ConfigError(
-                fault, where="--parts", allowed="--parts NAME,NAME --sensors N, or parts.names, parts.count"
-            )
+    allowed = "--parts NAME,NAME --sensors N, or parts.names, parts.count"
+    refuse_first({(fault, "--parts", allowed): is_found for fault, is_found in lacking.items()})
     return asked
 
 

@@ -20,6 +20,7 @@ from lidardesign.constraints.document import Constraints
 from lidardesign.constraints.feasibility import check_feasible
 from lidardesign.constraints.origins import inside_excluded, mounts_of, origin_box
 from lidardesign.errors import ConfigError, DataError
+from lidardesign.fitting.options import refuse_first
 from lidardesign.fitting.request import FitResult
 from lidardesign.numerics import FULL_TURN
 from lidardesign.rays import information
@@ -199,9 +200,7 @@ def ring_grid(space: DesignSpace, rays: int | None, count: int, channels: int) -
             f"a multiple of {rings}, at most {MOST_FILE_RAYS}: as many for each channel",
         ): points * rings != (rays or points * rings) or not 0 < points * rings <= MOST_FILE_RAYS,
     }
-    for (fault, where, allowed), is_found in faults.items():
-        if is_found:
-            raise ConfigError(fault, where=where, allowed=allowed)
+    refuse_first(faults)
     return even, points
 
 

@@ -27,7 +27,7 @@ from lidardesign.scoring.scene_scores import score_lists, without_each
 from lidardesign.sensors.adaptive import mapped, mean_mbps
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design import DesignSpec
-from lidardesign.simulate.plan import Decision, EffectPlan, Planner
+from lidardesign.simulate.plan import EffectPlan, Planner
 from lidardesign.simulate.returns import build_casters
 from lidardesign.task import Metric
 
@@ -113,7 +113,11 @@ class HeldBackScenes:
             if self.planner is not None:
                 if self.plan is None:
                     plan = self.planner.plan(scene, [rays for trial in missing for rays in trial.fired], casters)
-                    self.plan = replace(plan, decisions=tuple(map(_affordable, plan.decisions)))
+                    # an effect that takes a thousand times as long as others is left out, and its bound is kept
+                    self.plan = replace(
+                        plan,
+                        decisions=tuple(replace(one, on=one.on and one.name != "multipath") for one in plan.decisions),
+                    )
                 physics = self.planner.physics(self.plan, self.training.seed)
             jobs = list(itertools.chain(*lists))
             found = iter(score_lists(run.task, run.metric, scene, jobs, casters, physics))
@@ -132,11 +136,6 @@ class HeldBackScenes:
             f"judged under {self.planner.detector.name} with {', '.join(sorted(self.plan.effects)) or 'no effects'}; "
             f"the skipped ones could change ranges by {1000 * range_m:.3g} mm and {lost:.2%} of the returns at most"
         ]
-
-
-def _affordable(decision: Decision) -> Decision:
-    """An effect that takes a thousand times as long as others is left out; the bound of what it changes is kept."""
-    return replace(decision, on=decision.on and decision.name != "multipath")
 
 
 def trials_of(request: FitRequest, fit: Callable[[FitRequest], DesignSpec], counts: Sequence[int]) -> list[Trial]:

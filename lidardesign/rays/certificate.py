@@ -44,17 +44,10 @@ class Certificate:
     Arguments:
         value: F - price * bits - harm of the choice; without a price F - harm.
         bound: The least upper bound of it that was found, never below `value`.
-        rounds: Number of rounds.
     """
 
     value: float
     bound: float
-    rounds: int
-
-    def gap(self, complete: float) -> float:
-        """The largest possible reduction of the loss, relative to it; the loss is `complete` less the objective."""
-        loss = complete - self.value
-        return (self.bound - self.value) / loss if loss > 0 else 0.0
 
 
 def certificate_document(
@@ -116,12 +109,12 @@ def certify(
     value = choice.worth - choice.harm - (0.0 if budget_mbps is not None else choice.price * choice.bits)
     dual = Thresholds if len(coverage.table) == 0 else Tangents
     search = dual(coverage, _Admissible(coverage, counts, choice, budget_mbps, full=full), choice)
-    bound, made = np.inf, 0
-    while made < rounds:
-        bound, made = min(bound, search.step(value)), made + 1
+    bound = np.inf
+    for _ in range(rounds):
+        bound = min(bound, search.step(value))
         if bound - value <= COARSE_SLACK * abs(value):
             break
-    return Certificate(value, max(bound, value), made)
+    return Certificate(value, max(bound, value))
 
 
 class _Admissible:

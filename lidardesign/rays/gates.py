@@ -147,8 +147,8 @@ def central_intervals(values: np.ndarray, cell: np.ndarray, cells: int, levels: 
     return np.where(count > 0, low + (place - below) * (high - low), np.nan)
 
 
-def admissible_gates(wanted_m: np.ndarray, bounds: Bounds) -> tuple[np.ndarray, np.ndarray]:
-    """The gates inside bounds that are nearest to the wanted ones: centre and spread, shape (K,) each [m].
+def admitted_gates(wanted_m: np.ndarray, bounds: Bounds) -> np.ndarray:
+    """The gates inside bounds that are nearest to the wanted ones: start and end, shape (K, 2) [m].
 
     Nearest by the likelihood of ranges whose interval is the wanted gate, as in the M-step; a gate within its bounds
     is unchanged.
@@ -159,12 +159,7 @@ def admissible_gates(wanted_m: np.ndarray, bounds: Bounds) -> tuple[np.ndarray, 
     """
     centre, half = wanted_m.mean(axis=1), np.diff(wanted_m, axis=1)[:, 0] / 2
     smallest = THINNEST_GATE_M / (2 * bounds.interval)
-    return fit_gate(centre, np.square(np.maximum(half / bounds.interval, smallest)), bounds, smallest)
-
-
-def admitted_gates(wanted_m: np.ndarray, bounds: Bounds) -> np.ndarray:
-    """Start and end of the gates that `admissible_gates` finds, shape (K, 2) [m]."""
-    centre, spread = admissible_gates(wanted_m, bounds)
+    centre, spread = fit_gate(centre, np.square(np.maximum(half / bounds.interval, smallest)), bounds, smallest)
     half = bounds.interval * spread
     # half an ulp may take a gate that starts at 0 below it
     return np.maximum(np.stack([centre - half, centre + half], axis=1), 0.0)

@@ -125,6 +125,7 @@ def _key(selection: Selection, training: TrainingScenes, count: int) -> str:
     task = type(run.task)
     source = inspect.getsourcefile(task)
     folders = [Path(package_file).parent, *([Path(source).parent] if source else [])]
+    sources = [(str(path), path.stat()) for folder in folders for path in sorted(folder.rglob("*.py"))]
     made_of = {
         "config": run.config.as_document(),
         "inputs": input_hashes(run.config.task),
@@ -137,14 +138,9 @@ def _key(selection: Selection, training: TrainingScenes, count: int) -> str:
         "versions": versions(),
         "task": [distribution_of(run.task.name), task.__module__, task.__qualname__],
         # a version says nothing of sources under development
-        "source": [_stamp(path) for folder in folders for path in sorted(folder.rglob("*.py"))],
+        "source": [(name, state.st_size, state.st_mtime_ns) for name, state in sources],
     }
     return hashlib.sha256(json.dumps(made_of, sort_keys=True, default=str).encode()).hexdigest()
-
-
-def _stamp(path: Path) -> tuple[str, int, int]:
-    found = path.stat()
-    return str(path), found.st_size, found.st_mtime_ns
 
 
 def _packed(informed: Sequence[InformedScene], held_back: Sequence[InformedScene], rays: int) -> dict[str, np.ndarray]:

@@ -46,7 +46,6 @@ def host_mark() -> str:
 
 
 TEMPORARY_SUFFIX = ".tmp"
-CHUNK_BYTES = 1 << 20
 # Of a temporary file's name, which file systems limit to 255 bytes.
 NAME_BYTES = 100
 # .NAME.HOST-PROCESS.RANDOM.tmp
@@ -171,15 +170,12 @@ def sha256_file(path: Path) -> str:
     Raises:
         DataError: The file cannot be read.
     """
-    digest = hashlib.sha256()
     check_file(path, STATE)
     try:
         with Path(path).open("rb") as file:
-            while chunk := file.read(CHUNK_BYTES):
-                digest.update(chunk)
+            return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
         raise DataError(f"cannot be read: {error.strerror or error}", where=str(path)) from error
-    return digest.hexdigest()
 
 
 FILE_NAME = ".lock"

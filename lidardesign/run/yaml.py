@@ -1,14 +1,13 @@
 """YAML with positions and without surprises.
 
 The readable subset of YAML 1.2: plain scalars are null, true, false, decimal numbers (`1e-3` is one, `010` is
-ten) or text (`no`, `on`, `1:30` and dates stay text). Tags, merge keys, duplicate keys, numbers that are not
-finite, deep nesting and aliases that expand beyond a limit are errors that name file, line and column.
+ten) or text (`no`, `on`, `1:30` and dates stay text). Tags, aliases, merge keys, duplicate keys, numbers that are not
+finite, and deep nesting are errors that name file, line and column.
 Nothing in a file is ever executed.
 """
 
 from __future__ import annotations
 
-import copy
 import math
 import re
 from collections.abc import Iterator
@@ -171,17 +170,7 @@ class _Frame:
 
     value: Any
     path: KeyPath
-    anchor: str | None
-    nodes_before: int
-    height: int = 1
     key: str | None = None
-
-
-@dataclass(frozen=True)
-class _Anchor:
-    value: Any
-    nodes: int
-    height: int
 
 
 class _Builder:
@@ -193,7 +182,6 @@ class _Builder:
         self.keys: dict[KeyPath, Position] = {}
         self.values: dict[KeyPath, Position] = {}
         self._stack: list[_Frame] = []
-        self._anchors: dict[str, _Anchor] = {}
         self._nodes = 0
         self._documents = 0
 
@@ -203,26 +191,16 @@ class _Builder:
             if self._documents > 1:
                 raise self._error(event, "a second document starts here", "one document per file")
         elif isinstance(event, yaml.AliasEvent):
-            anchor = self._anchors.get(event.anchor)
-            if anchor is None:
-                raise self._error(event, f"the alias *{event.anchor} has no complete anchor before it", hint=QUOTE_HINT)
-            if self._expects_key():
-                raise self._error(event, "an alias cannot be a key", "names as keys")
-            if len(self._stack) + anchor.height > MAX_DEPTH:
-                raise self._error(event, "nested too deeply", f"at most {MAX_DEPTH} levels")
-            self._count(event, anchor.nodes)
-            self._put(copy.deepcopy(anchor.value), event)
-            if self._stack:
-                self._stack[-1].height = max(self._stack[-1].height, anchor.height + 1)
+            raise self._error(event, f"the alias *{event.anchor} is not supported", "the value itself", QUOTE_HINT)
         elif isinstance(event, yaml.ScalarEvent):
             self._scalar(event)
         elif isinstance(event, yaml.CollectionStartEvent):
             self._open(event)
         elif isinstance(event, yaml.CollectionEndEvent):
-            self._close()
+            self._stack.pop()
 
     def _scalar(self, event: yaml.ScalarEvent) -> None:
-        self._check_tag(event)
+        self._check(event)
         plain = not event.style and event.implicit[0]
         if self._expects_key():
             key, frame = event.value, self._stack[-1]
@@ -242,39 +220,26 @@ class _Builder:
                 raise self._error(event, f"the key {key!r} was given before, in line {first[0]}", "each key once")
             frame.key = key
             self.keys[(*frame.path, key)] = _position(event)
-            self._count(event, 1)
             return
         try:
             value = resolve_scalar(event.value) if plain else event.value
         except ValueError as error:
             name = ".".join(map(str, self._next_path()))
             raise self._error(event, f"{name}: {error}" if name else str(error)) from None
-        self._count(event, 1)
         path = self._put(value, event)
         if plain and not event.value and len(path) > self.empty_sections:
             name = ".".join(map(str, path))
             raise self._error(event, f"{name} has no value", "a value, or null for none", "leave the key out")
-        if event.anchor:
-            self._anchors[event.anchor] = _Anchor(value, 1, 0)
 
     def _open(self, event: yaml.CollectionStartEvent) -> None:
-        self._check_tag(event)
+        self._check(event)
         if self._expects_key():
             raise self._error(event, "a list or mapping cannot be a key", "names as keys")
         if len(self._stack) >= MAX_DEPTH:
             raise self._error(event, "nested too deeply", f"at most {MAX_DEPTH} levels")
         value: Any = {} if isinstance(event, yaml.MappingStartEvent) else []
-        nodes_before = self._nodes
-        self._count(event, 1)
         path = self._put(value, event)
-        self._stack.append(_Frame(value, path, event.anchor, nodes_before))
-
-    def _close(self) -> None:
-        frame = self._stack.pop()
-        if self._stack:
-            self._stack[-1].height = max(self._stack[-1].height, frame.height + 1)
-        if frame.anchor:
-            self._anchors[frame.anchor] = _Anchor(frame.value, self._nodes - frame.nodes_before, frame.height)
+        self._stack.append(_Frame(value, path))
 
     def _expects_key(self) -> bool:
         return bool(self._stack) and isinstance(self._stack[-1].value, dict) and self._stack[-1].key is None
@@ -296,12 +261,11 @@ class _Builder:
         self.values[path] = _position(event)
         return path
 
-    def _count(self, event: yaml.Event, nodes: int) -> None:
-        self._nodes += nodes
+    def _check(self, event: Any) -> None:
+        """Refuse a tag, and more values than a document may have."""
+        self._nodes += 1
         if self._nodes > MAX_NODES:
-            raise self._error(event, "expands to too many values", f"at most {MAX_NODES}, aliases counted each time")
-
-    def _check_tag(self, event: Any) -> None:
+            raise self._error(event, "has too many values", f"at most {MAX_NODES}")
         if event.tag is not None:
             raise self._error(event, f"the tag {event.tag!r} is not supported", hint="remove it; quotes make text")
 

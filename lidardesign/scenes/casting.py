@@ -27,7 +27,7 @@ MAXIMUM_LAYERS = 16
 CROSSINGS_PER_RAY = 2  # of primitives, allocated at first
 RAYS_AT_ONCE = 100_000  # over frames that are traced together
 
-Only = Literal["all", "targets", "occluders"]
+Only = Literal["all", "targets", "occluders", "resting"]
 
 
 class SceneCaster:
@@ -49,11 +49,6 @@ class SceneCaster:
         self.moving = _Moving(moving, frame) if moving else None
         primitives = [(i, body) for i, body in chosen if not isinstance(body.shape, Mesh)]
         self.primitives = Primitives(primitives, frame) if primitives else None
-
-    @property
-    def resting(self) -> _AtRest | None:
-        """The meshes at rest, or None if there are other shapes too."""
-        return None if self.primitives or self.moving else self.at_rest
 
     def first_hit(self, origins: np.ndarray, directions: np.ndarray) -> Hits:
         """First hits of rays, origins and directions of shape (N, 3); directions are normalised here.
@@ -160,7 +155,7 @@ def trace_each(
     Rays and hits are as in `SceneCaster.trace`. Casters of meshes at rest alone, which are many in learning, run only
     Embree's calls one by one.
     """
-    resting = [caster.resting for caster in casters]
+    resting = [None if caster.primitives or caster.moving else caster.at_rest for caster in casters]
     if any(meshes is None for meshes in resting):
         parts = [
             caster.trace(origins[begin:end], directions[begin:end], limit_m[begin:end])
@@ -194,8 +189,8 @@ def trace_each(
 
 
 def _chosen(scene: Scene, only: Only) -> list[tuple[int, Body]]:
-    keep = {"all": lambda body: True, "targets": lambda body: body.is_target, "occluders": lambda b: b.is_occluder}
-    return [(i, body) for i, body in enumerate(scene.bodies) if keep[only](body)]
+    attribute = {"targets": "is_target", "occluders": "is_occluder", "resting": "is_resting"}.get(only)
+    return [(i, body) for i, body in enumerate(scene.bodies) if attribute is None or getattr(body, attribute)]
 
 
 _casters: WeakKeyDictionary[Scene, dict[tuple[int, ...], SceneCaster]] = WeakKeyDictionary()

@@ -17,12 +17,12 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from lidardesign.errors import BackgroundNote, DataError, LidardesignError
+from lidardesign.errors import BackgroundNote, DataError
 from lidardesign.numerics import ROUNDING
+from lidardesign.run.arrays import guarded
 from lidardesign.run.inputs import MESH, check_bytes, read_file
-from lidardesign.scenes.mesh_formats import check_gltf, check_ply, check_triangles, read_obj, read_off, read_stl
-from lidardesign.scenes.scene import LARGEST_WEIGHT, Mesh, Sign
-from lidardesign.space import FARTHEST_M
+from lidardesign.scenes.mesh_formats import AGAIN_HINT, check_count, check_gltf, check_ply, read_obj, read_off, read_stl
+from lidardesign.scenes.scene import LARGEST_WEIGHT, Mesh, Sign, check_triangles
 
 if TYPE_CHECKING:
     import trimesh
@@ -266,7 +266,7 @@ def check_mesh(
         faces = np.asarray(faces)
     except (TypeError, ValueError) as error:
         raise DataError(f"vertices or faces are not numbers ({error})", where=where) from error
-    _refuse_unusable(vertices, faces, where)
+    check_triangles(vertices, faces, where)
     if importance is not None and np.shape(importance) != vertices.shape[:1]:
         raise DataError(f"has {np.shape(importance)} weights for {len(vertices)} vertices", where=where)
     notes: list[str] = []
@@ -283,39 +283,6 @@ def check_mesh(
     vertices, faces = vertices[used], faces.reshape(-1, 3)
     faces, rule = _oriented(vertices, faces, sign, notes, where)
     return Mesh(vertices, faces, rule, tuple(notes), importance)
-
-
-def _refuse_unusable(vertices: np.ndarray, faces: np.ndarray, where: str) -> None:
-    if vertices.size == 0 or faces.size == 0:
-        raise DataError("has no faces (an empty or unreadable mesh)", where=where, hint="open it in a mesh viewer")
-    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
-        raise DataError(
-            f"vertices and faces have shapes {vertices.shape} and {faces.shape}",
-            where=where,
-            allowed="(V, 3) and (F, 3)",
-        )
-    if not np.issubdtype(faces.dtype, np.integer):
-        raise DataError(f"faces are of type {faces.dtype}", where=where, allowed="integer vertex indices")
-    bad = int((~np.isfinite(vertices).all(axis=1)).sum())
-    if bad:
-        raise DataError(
-            f"{bad} of {len(vertices)} vertices are NaN or infinite",
-            where=where,
-            hint="export the mesh again",
-        )
-    farthest = float(np.abs(vertices).max())
-    if farthest > FARTHEST_M:
-        raise DataError(
-            f"reaches {farthest:.3g} m",
-            where=where,
-            allowed=f"within {FARTHEST_M:g} m of the origin",
-            hint="is the scale right?",
-        )
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        wrong = int(((faces < 0) | (faces >= len(vertices))).any(axis=1).sum())
-        raise DataError(
-            f"{wrong} faces name vertices that do not exist", where=where, allowed=f"0 to {len(vertices) - 1}"
-        )
 
 
 def usable_faces(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> np.ndarray:
@@ -382,28 +349,24 @@ def _read(path: Path, painted: Painted | None) -> tuple[np.ndarray, np.ndarray, 
     data = read_file(path, MESH, hint="check the path")
     if not data.strip():
         raise DataError("is an empty file", where=where)
+    return guarded(lambda: _geometry(path, data, painted), path, AGAIN_HINT)
+
+
+@contextmanager
+def _quiet_trimesh() -> Iterator[None]:
+    """Silence the log of loaders; a warning that means data loss becomes an error, where warnings are caught."""
+    log = logging.getLogger("trimesh")
+    level = log.level
+    log.setLevel(logging.CRITICAL + 1)
     try:
-        with _quiet_trimesh():
-            return _geometry(path, data, painted)
-    except LidardesignError:
-        raise
-    # loaders raise anything on garbage: IndexError, KeyError, ModuleNotFoundError, struct.error
-    except Exception as error:
-        raise DataError(
-            f"cannot be read as a mesh ({_reason(error)})",
-            where=where,
-            allowed=", ".join(SUFFIXES),
-            hint="open it in a mesh viewer and export it again",
-        ) from error
+        # numpy stops at text that is no number and would drop the rest silently
+        warnings.filterwarnings("error", "string or file could not be read")
+        yield
+    finally:
+        log.setLevel(level)
 
 
-def _reason(error: Exception) -> str:
-    """Message of an error in one line; trimesh needs an optional package for text that is not UTF-8."""
-    if isinstance(error, ModuleNotFoundError):
-        return "it is not UTF-8 text" if error.name == "charset_normalizer" else f"needs {error.name}"
-    return f"{type(error).__name__}: {(str(error) or 'no reason given').splitlines()[0]}"
-
-
+@_quiet_trimesh()
 def _geometry(path: Path, data: bytes, painted: Painted | None) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """All triangles of a file as one mesh, each part with its transform; weights if `painted` is given."""
     vertices, faces, weights, count = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], [np.zeros(0)], 0
@@ -422,7 +385,7 @@ def _geometry(path: Path, data: bytes, painted: Painted | None) -> tuple[np.ndar
         count += len(part.vertices)
         if painted is not None:
             weights.append(painted_weights(part, painted, str(path)))
-    check_triangles(sum(map(len, faces)), str(path))
+    check_count(sum(map(len, faces)), str(path))
     return np.concatenate(vertices), np.concatenate(faces), np.concatenate(weights) if painted else None
 
 
@@ -478,19 +441,3 @@ class _SameFolder:
         return content
 
     __getitem__ = get
-
-
-@contextmanager
-def _quiet_trimesh() -> Iterator[None]:
-    """Silence the log and the warnings of loaders, except one that means data loss, which becomes an error."""
-    log = logging.getLogger("trimesh")
-    level = log.level
-    log.setLevel(logging.CRITICAL + 1)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            # numpy stops at text that is no number and would drop the rest silently
-            warnings.filterwarnings("error", "string or file could not be read")
-            yield
-    finally:
-        log.setLevel(level)

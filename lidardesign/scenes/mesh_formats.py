@@ -338,7 +338,7 @@ def _check_nodes(document: dict[str, Any], where: str) -> None:
         if depth > DEEPEST_NODE:
             raise DataError(f"nodes[{number}] is nested too deep", where=where, allowed=f"{DEEPEST_NODE} levels")
     placed = sum(meshes) + sum(meshes[node["mesh"]] for node in nodes if isinstance(node, dict) and "mesh" in node)
-    check_triangles(placed // 2, where)
+    check_count(placed // 2, where)
 
 
 def _size(mesh: Any, accessors: list[Any], place: str, where: str) -> int:
@@ -356,7 +356,7 @@ def _size(mesh: Any, accessors: list[Any], place: str, where: str) -> int:
     return total
 
 
-def check_triangles(count: int, where: str) -> None:
+def check_count(count: int, where: str) -> None:
     """Refuse more than `MOST_TRIANGLES` triangles.
 
     Raises:

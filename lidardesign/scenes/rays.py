@@ -14,7 +14,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -42,8 +42,24 @@ class Outcome(IntEnum):
     NOT_DETECTED = 4
 
 
+class FlatLists:
+    """Flat lists side by side, as a dataclass that holds arrays of one length alone, or None for some."""
+
+    def __len__(self) -> int:
+        return len(next(iter(vars(self).values())))
+
+    def subset(self, chosen: np.ndarray | slice) -> Self:
+        """The rows at an index or mask."""
+        return type(self)(*(None if column is None else column[chosen] for column in vars(self).values()))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Self]) -> Self:
+        """Several lists as one, one after the other."""
+        return cls(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
+
+
 @dataclass(frozen=True, eq=False)
-class Rays:
+class Rays(FlatLists):
     """An explicit list of rays, in the order in which they fire.
 
     Arguments:
@@ -137,13 +153,6 @@ class Rays:
         """These rays as read from a file: directions computed from their angles, which may differ by rounding."""
         return Rays.from_angles(self.origin_m, *angles(self.direction), self.gate_m, self.sensor)
 
-    def __len__(self) -> int:
-        return len(self.origin_m)
-
-    def subset(self, keep: np.ndarray) -> Rays:
-        """The rays at an index or mask."""
-        return Rays(*(None if column is None else column[keep] for column in vars(self).values()))
-
 
 @dataclass(frozen=True, eq=False)
 class Returns:
@@ -181,7 +190,7 @@ class Returns:
 
 
 @dataclass(frozen=True, eq=False)
-class Hits:
+class Hits(FlatLists):
     """First hits of N rays.
 
     Arguments:
@@ -198,15 +207,6 @@ class Hits:
     def none(cls, count: int) -> Hits:
         """`count` misses."""
         return cls(np.full(count, np.inf), np.full(count, -1, dtype=np.int64), np.zeros((count, 3)))
-
-    @classmethod
-    def joined(cls, parts: Sequence[Hits]) -> Hits:
-        """Concatenated lists of hits."""
-        return cls(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
-
-    def subset(self, chosen: np.ndarray | slice) -> Hits:
-        """The hits at an index or mask."""
-        return Hits(*(column[chosen] for column in vars(self).values()))
 
 
 class Crossings(NamedTuple):

@@ -112,6 +112,44 @@ class Plane:
     """The half space z <= 0, whose surface is the infinite plane z = 0 with the normal +z."""
 
 
+def check_triangles(vertices: np.ndarray, faces: np.ndarray, where: str = "mesh") -> None:
+    """Refuse arrays that are no finite vertices (V, 3), and faces (F, 3) of them, at least one.
+
+    Raises:
+        DataError: What is wrong, and how many.
+    """
+    if vertices.size == 0 or faces.size == 0:
+        raise DataError("has no faces (an empty or unreadable mesh)", where=where, hint="open it in a mesh viewer")
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
+        raise DataError(
+            f"vertices and faces have shapes {vertices.shape} and {faces.shape}",
+            where=where,
+            allowed="(V, 3) and (F, 3)",
+        )
+    if not np.issubdtype(faces.dtype, np.integer):
+        raise DataError(f"faces are of type {faces.dtype}", where=where, allowed="integer vertex indices")
+    bad = int((~np.isfinite(vertices).all(axis=1)).sum())
+    if bad:
+        raise DataError(
+            f"{bad} of {len(vertices)} vertices are NaN or infinite",
+            where=where,
+            hint="export the mesh again",
+        )
+    farthest = float(np.abs(vertices).max())
+    if farthest > FARTHEST_M:
+        raise DataError(
+            f"reaches {farthest:.3g} m",
+            where=where,
+            allowed=f"within {FARTHEST_M:g} m of the origin",
+            hint="is the scale right?",
+        )
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        wrong = int(((faces < 0) | (faces >= len(vertices))).any(axis=1).sum())
+        raise DataError(
+            f"{wrong} faces name vertices that do not exist", where=where, allowed=f"0 to {len(vertices) - 1}"
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class Mesh:
     """A triangle mesh.
@@ -135,19 +173,10 @@ class Mesh:
     def __post_init__(self) -> None:
         vertices = np.ascontiguousarray(self.vertices, dtype=np.float64)
         faces = np.asarray(self.faces)
-        if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3 or not len(faces):
-            raise DataError(f"a mesh needs (V, 3) vertices and (F, 3) faces, found {vertices.shape} and {faces.shape}")
-        if not np.isfinite(vertices).all():
-            raise DataError("a mesh has vertices that are NaN or infinite")
-        farthest = float(np.abs(vertices).max())
-        if farthest > FARTHEST_M:
-            raise DataError(f"a mesh has vertices {farthest:g} m away", allowed=f"at most {FARTHEST_M:g} m")
+        check_triangles(vertices, faces)
         size = float(np.ptp(vertices, axis=0).max())
         if size < SMALLEST_M:
             raise DataError(f"a mesh is {size:g} m in size", allowed=f"at least {SMALLEST_M:g} m")
-        if faces.min() < 0 or faces.max() >= len(vertices):
-            worst = faces.min() if faces.min() < 0 else faces.max()
-            raise DataError(f"a mesh of {len(vertices)} vertices has faces that name vertex {int(worst)}")
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "faces", np.ascontiguousarray(faces, dtype=np.int32))
         if self.importance is not None:
@@ -339,6 +368,11 @@ class Body:
     def is_occluder(self) -> bool:
         """True if it blocks rays in the density."""
         return self.role != "target"
+
+    @property
+    def is_resting(self) -> bool:
+        """True if it has one pose and no velocity."""
+        return self.poses.ndim == 2 and not any(self.velocity_m_s)
 
     def pose(self, frame: int = 0) -> np.ndarray:
         """Pose (4, 4) at a frame; a body at rest has the same one in all frames."""

@@ -79,11 +79,10 @@ class Claim:
         photons = detector.photons
         count = round(np.clip(BENCH_PULSES / photons.pulses(rays), FEWEST_BENCH_RAYS, BENCH_RAYS))
         scale = count / rays
-        flood = photons.emission == "flood"
         photons = replace(
             photons,
-            pulse_energy_j=photons.pulse_energy_j * light * (scale if flood else 1.0),
-            pulses_per_frame=photons.pulses_per_frame * (1.0 if flood else scale),
+            pulse_energy_j=photons.pulse_energy_j * light * (scale if detector.is_flood else 1.0),
+            pulses_per_frame=photons.pulses_per_frame * (1.0 if detector.is_flood else scale),
         )
         bench = replace(detector, photons=photons, emitters="shared", bins=None)
         pose = np.eye(4)

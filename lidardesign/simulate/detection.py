@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidardesign.errors import ConfigError
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Scene
 from lidardesign.simulate.detector.dead_time import find_corrected
@@ -328,29 +327,3 @@ def _add_bin_by_bin(
     else:
         found = even_counts(expected, offset)
     add_bins(counts, bins.offset, many, found)
-
-
-def coates(counts: np.ndarray, pulses: float) -> np.ndarray:
-    """Coates' correction: arrived photons per pulse and bin, from the counts of a detector blind after the first.
-
-    A bin's photons can only be counted in pulses without an earlier count: log((P - C_before) / (P - C_to_here)), with
-    C the running count (Coates 1968). NaN in bins after every pulse has a count.
-
-    Arguments:
-        counts: Photons counted per bin, from the time on at which the detector was armed, shape (..., B).
-        pulses: Number of pulses.
-
-    Raises:
-        ConfigError: More photons were counted than there were pulses.
-    """
-    counts = np.asarray(counts, dtype=np.float64)
-    used = np.cumsum(counts, axis=-1)
-    if (used[..., -1:] > pulses).any() or (counts < 0).any():
-        raise ConfigError(
-            f"{used[..., -1:].max():g} photons in {pulses:g} pulses",
-            where="Coates' correction",
-            allowed="at most one photon per pulse, and no negative counts",
-        )
-    with np.errstate(divide="ignore", invalid="ignore"):
-        arrived = np.log((pulses - used + counts) / (pulses - used))
-    return np.where(pulses - used > 0, arrived, np.nan)

@@ -235,9 +235,8 @@ class Planner:
         Raises:
             ConfigError: An effect that was named cannot be simulated here, or a gate lies outside the histogram.
         """
-        if self.detector.bins is not None or self.detector.photons is not None:
-            for rays in lists:
-                check_windows(path_windows(rays, scene.receiver), self.detector)
+        for rays in lists:
+            check_windows(path_windows(rays, scene.receiver), self.detector)
         found = _bounds(scene, lists, self.detector, casters)
         rays = sum(len(rays) for rays in lists) * scene.frames
         return self._decided(found, {name: predicted_seconds(name, self.detector, rays) for name in EFFECTS})
@@ -254,7 +253,7 @@ class Planner:
                 # counted echoes mix in another way than uncounted ones
                 wanted.add(max(COUNTED, key=lambda name: (found[name].relative(self.tolerated), name)))
         elif self.choice == "all":
-            wanted = available_effects(self.detector)
+            wanted = frozenset(EFFECTS) - ({"motion"} if motion.is_instant(self.detector) else set())
         else:
             wanted = frozenset() if self.choice == "none" else self.choice
         missing = {name: transport.missing() if name == "multipath" else None for name in sorted(wanted)}
@@ -277,29 +276,14 @@ def parse_effects(text: str) -> Choice:
         ConfigError: An unknown effect; all are listed.
     """
     names = [name.strip() for name in text.split(",")]
-    allowed = f"{', '.join(WORDS)}, or any of {', '.join(EFFECTS)}"
     if names[0] in CHOICES and len(names) == 1:
         return names[0]  # type: ignore[return-value]
-    if not all(names):
-        raise ConfigError(f"{text!r} has an empty effect name", where="--effects", allowed=allowed)
     for name in names:
-        if name in WORDS:
-            raise ConfigError(
-                f"{name!r} cannot be combined with effects", where="--effects", allowed=f"{name} alone, or names"
-            )
         if name not in EFFECTS:
-            raise ConfigError(
-                f"unknown effect {name!r}",
-                where="--effects",
-                allowed=allowed,
-                hint=suggest(name.lower(), [*EFFECTS, *WORDS]),
-            )
+            allowed = f"one of {', '.join(WORDS)} alone, or any of {', '.join(EFFECTS)}"
+            hint = None if name in WORDS else suggest(name.lower(), [*EFFECTS, *WORDS])
+            raise ConfigError(f"unknown effect {name!r}", where="--effects", allowed=allowed, hint=hint)
     return frozenset(names)
-
-
-def available_effects(detector: Detector) -> frozenset[str]:
-    """Names of the effects that apply to a detector."""
-    return frozenset(EFFECTS) - ({"motion"} if motion.is_instant(detector) else set())
 
 
 def _called_for(found: dict[str, Bound], tolerance: Tolerance) -> set[str]:

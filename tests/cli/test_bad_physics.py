@@ -51,9 +51,9 @@ CASES = [
     ("evaluate run --effects ambint", 2, "did you mean 'ambient'"),
     ("evaluate run --effects dew", 2, "unknown effect 'dew'"),
     ("evaluate run --effects ALL", 2, "did you mean 'all'"),
-    ("evaluate run --effects audit,all", 2, "'audit' cannot be combined with effects"),
-    ("evaluate run --effects jitter,none", 2, "'none' cannot be combined with effects"),
-    ("evaluate run --effects jitter,", 2, "has an empty effect name"),
+    ("evaluate run --effects audit,all", 2, "one of auto, all, none, audit alone"),
+    ("evaluate run --effects jitter,none", 2, "one of auto, all, none, audit alone"),
+    ("evaluate run --effects jitter,", 2, "unknown effect ''"),
     *(
         (f"evaluate run {option} {value}", 2, f"{option}: ")
         for option in ("--range-tolerance-mm", "--return-tolerance")
@@ -193,7 +193,7 @@ def test_a_library_that_cannot_be_is_named_where_it_comes_from(monkeypatch, tmp_
     monkeypatch.setattr(light_transport_process, "PACKAGES", {})
     for wrong in (tmp_path, tmp_path / "absent.so"):
         monkeypatch.setenv("DRJIT_LIBLLVM_PATH", str(wrong))
-        assert light_transport_process.missing().startswith(f"DRJIT_LIBLLVM_PATH names {wrong}, which is not an LLVM")
+        assert light_transport_process.missing().endswith(f"newer: {wrong}")
 
 
 def interrupted_kernel():

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from support.sensors import normal_sensor
 
 from lidardesign.mixture.bounds import Bounds
-from lidardesign.rays.gates import admissible_gates, bounded_gates, central_intervals
+from lidardesign.rays.gates import admitted_gates, bounded_gates, central_intervals
 from lidardesign.sensors.sensor import DEFAULT_LEVEL, interval_factor
 
 LEVEL_FACTOR = 1.96
@@ -32,9 +32,7 @@ def test_intervals_are_the_naive_quantiles_of_each_cell(seed, count):
 
 def test_a_gate_that_keeps_its_bounds_stays_as_it_is():
     wanted = np.array([[0.3, 0.5], [0.4, 0.45]])
-    centre, spread = admissible_gates(wanted, Bounds.unbounded(2, LEVEL_FACTOR))
-    half = LEVEL_FACTOR * spread
-    np.testing.assert_allclose(np.stack([centre - half, centre + half], 1), wanted, rtol=1e-12)
+    np.testing.assert_allclose(admitted_gates(wanted, Bounds.unbounded(2, LEVEL_FACTOR)), wanted, rtol=1e-12)
 
 
 @given(st.floats(0.1, 1.0), st.floats(0, 0.5), st.floats(0.05, 0.6), st.floats(0, 0.3), st.floats(0, 0.6))
@@ -47,11 +45,10 @@ def test_any_gate_is_moved_inside_its_bounds(start, width, start_high, width_low
         width_low=np.array([width_low]),
         width_high=np.array([width_low + width_more + 1e-3]),
     )
-    centre, spread = admissible_gates(np.array([[start, start + width]]), bounds)
-    half = LEVEL_FACTOR * spread[0]
-    assert 0.05 - 1e-9 <= centre[0] - half <= start_high + 1e-9
-    assert centre[0] + half <= 1.5 + 1e-9
-    assert width_low - 1e-9 <= 2 * half <= width_low + width_more + 1e-3 + 1e-9
+    ((begin, end),) = admitted_gates(np.array([[start, start + width]]), bounds)
+    assert 0.05 - 1e-9 <= begin <= start_high + 1e-9
+    assert end <= 1.5 + 1e-9
+    assert width_low - 1e-9 <= end - begin <= width_low + width_more + 1e-3 + 1e-9
 
 
 @given(st.floats(0.1, 1.0), st.floats(0.05, 0.5), st.floats(0.1, 1.2), st.floats(0.0, 0.25))

@@ -389,7 +389,7 @@ def test_scenes_of_the_same_bodies_share_what_is_built_of_their_meshes_and_other
     balls = [Body(ball, f"ball {i}", poses=rigid(translation_m=(2.0 + i, 0, 0))) for i in range(2)]
     first, second = Scene(tuple(balls), "first"), Scene(tuple(balls), "second")
     alone = Scene((balls[0],), "alone")
-    resting = [SceneCaster(scene).resting for scene in (first, second, alone)]
+    resting = [SceneCaster(scene).at_rest for scene in (first, second, alone)]
     assert resting[0] is resting[1]
     assert resting[2] is not resting[0]
     turned = Scene(tuple(balls[::-1]), "turned")

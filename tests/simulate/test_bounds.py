@@ -45,7 +45,6 @@ from lidardesign.scenes.scene import (
 from lidardesign.simulate.detector.physics import Physics, metres
 from lidardesign.simulate.effects.expected_counts import (
     Blindness,
-    estimate_error_m,
     missed_behind,
     needed_counts,
     share_in_bins,
@@ -138,7 +137,7 @@ def test_estimated_ranges_stray_no_further_than_bounded(estimator, signal, bins_
     bin_m = sigma_m / bins_per_sigma
     bin_s = 2 * bin_m / 299792458
     detector = replace(SINGLE, estimator=estimator, pulse_sigma_s=5e-11, jitter_sigma_s=0.0, bin_s=bin_s)
-    bounded = float(estimate_error_m(detector, np.array([float(signal)]), sigma_m)[0])
+    bounded = float(counts(facing_wall(), detector, NARROW).error_m(np.array([float(signal)]), sigma_m)[0])
     photons = sigma_m * generator.normal(size=(draws, signal))
     if estimator == "matched":
         strayed = photons.mean(axis=1)

@@ -8,8 +8,6 @@ from scipy.stats import chi2, norm
 from support.references import STANDARD_ERRORS, first_photon_distribution, naive_counts_with_dead_time
 from support.synthetic_light import PULSES, background, counted, counting_detector, no_echoes, single_echoes, windows
 
-from lidardesign.errors import ConfigError
-from lidardesign.simulate.detection import coates
 from lidardesign.simulate.detector.dead_time import (
     DRAWS_PER_BIN,
     _across_pulses,
@@ -199,31 +197,14 @@ def test_pile_up_only_takes_photons_away():
     assert counts.sum() < arrived.sum()
 
 
-def test_coates_undoes_pile_up_exactly_on_expected_counts():
-    arriving = np.random.default_rng(1).uniform(0, 0.2, BINS)
-    expected = 1e4 * first_photon_distribution(arriving)[:-1]
-    # differences of logarithms of numbers near 1, each rounded
-    np.testing.assert_allclose(coates(expected, 1e4), arriving, atol=1e-12)
-
-
-def test_coates_undoes_pile_up_on_counted_photons_within_their_noise():
+def test_coates_correction_undoes_pile_up_on_counted_photons_within_their_noise():
     per_bin = 0.04
     counts = even_light(per_bin).sum(axis=0)
     pulses = RAYS * PULSES
-    arrived = coates(counts, pulses)
+    # Coates 1968
+    used = np.cumsum(counts)
+    arrived = np.log((pulses - used + counts) / (pulses - used))
     alive = pulses * np.exp(-per_bin * np.arange(BINS))
     # binomial counts of alive pulses
     assert (np.abs(arrived - per_bin) < STANDARD_ERRORS * np.sqrt(per_bin / alive)).all()
     assert counts[-1] / pulses < 0.25 * per_bin
-
-
-def test_coates_knows_nothing_after_the_last_pulse_is_used_up():
-    corrected = coates(np.array([5, 5, 0]), 10)
-    assert corrected[0] == pytest.approx(np.log(2))
-    assert np.isnan(corrected[1:]).all()
-
-
-@pytest.mark.parametrize("counts", [[6, 5], [-1, 2]])
-def test_coates_refuses_counts_that_no_single_photon_detector_gives(counts):
-    with pytest.raises(ConfigError, match="at most one photon per pulse"):
-        coates(np.array(counts), 10)

@@ -37,11 +37,6 @@ def wall(x_m=4.0, **material):
     return Body(Box((0.1, 20, 20)), poses=rigid(translation_m=(x_m + 0.1, 0, 0)), **material)
 
 
-def test_without_a_receiver_echoes_stay_the_same_object():
-    direct, kept = both(Scene((wall(),)), fan())
-    assert kept is direct
-
-
 def test_the_shadow_of_a_ball_on_a_wall_is_its_cone():
     ball = Body(Sphere(0.3), poses=rigid(translation_m=(2.0, 0.5, 0.0)))
     direct, kept = both(Scene((wall(), ball), receiver=BESIDE), fan(4000))

@@ -326,11 +326,6 @@ def parse_at(texts: list[str] | None) -> dict[str, float]:
     return values
 
 
-def sensor_count(text: str | None) -> int | str | None:
-    """The value of `--sensors`: an int where it is a number, else the text as it is."""
-    return int(text) if text is not None and re.fullmatch("[0-9]{1,9}", text) else text
-
-
 def part_names(
     parts: str | None, modules: int | None, fov: str | None, zones: str | None, sensors: str | None
 ) -> tuple[list[str] | str | None, int | str | None]:
@@ -343,7 +338,8 @@ def part_names(
         names = [] if parts is None else [name.strip() for name in parts.split(",")]
         if not all(names):
             raise ConfigError(f"{parts!r} has an empty part name", where="--parts", allowed="NAME,NAME or catalog")
-        return (parts if parts in (None, "catalog") else names), sensor_count(sensors)
+        count = int(sensors) if sensors is not None and re.fullmatch("[0-9]{1,9}", sensors) else sensors
+        return (parts if parts in (None, "catalog") else names), count
     if None in (modules, fov, zones) or (parts, sensors) != (None, None):
         allowed = "--modules N --fov WxH --zones CxR, without --sensors and --parts"
         raise ConfigError("the description of the modules is incomplete", where="--modules", allowed=allowed)

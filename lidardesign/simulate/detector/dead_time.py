@@ -167,10 +167,7 @@ def alive_shares(counts, pulses, dead, period):  # noqa: ANN001, ANN201
 
     Blind are the pulses with a count less than a dead time ago, in the same pulse or in one before.
     """
-    size = len(counts)
-    running = np.zeros(size + 1)
-    for b in range(size):
-        running[b + 1] = running[b] + counts[b]
+    size, running = len(counts), _running(counts)
     alive = np.empty(size)
     for b in range(size):
         blind = running[b] - running[min(max(math.floor(b - dead) + 1, 0), b)]
@@ -194,10 +191,7 @@ def arrived_photons(counted, pulses):  # noqa: ANN001, ANN201
 
 @njit(cache=True, nogil=True)
 def _running(values):  # noqa: ANN001, ANN202
-    sums = np.zeros(len(values) + 1)
-    for b in range(len(values)):
-        sums[b + 1] = sums[b] + values[b]
-    return sums
+    return np.append(0.0, np.cumsum(values.astype(np.float64)))
 
 
 @njit(cache=True, nogil=True)
@@ -265,10 +259,7 @@ def find_corrected(  # noqa: ANN201
 ):
     """Find returns as `find_returns`, corrected for dead time, given pulses of each ray, dead time, period in bins."""
     found = np.full(len(offset) - 1, np.nan)
-    longest = 0
-    for i in range(len(offset) - 1):
-        longest = max(longest, offset[i + 1] - offset[i])
-    score = np.empty(longest)
+    score = np.empty(np.append(np.diff(offset), 0).max())
     for i in range(len(offset) - 1):
         mine = counts[offset[i] : offset[i + 1]]
         size, total = len(mine), mine.sum()

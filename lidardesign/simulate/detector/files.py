@@ -151,24 +151,15 @@ def _check_keys(document: Document, values: Mapping[str, Any]) -> None:
         where = document.locate((key,), key=True)
         name = key if key == "name" or key in CHOICES else spelled.get(key)
         if name is None:
-            raise _unknown(key, where, [*spelled, "name", *CHOICES])
+            meant = key if key in QUANTITIES else key.rpartition("_")[0]
+            allowed = QUANTITIES[meant].keys(meant) if meant in QUANTITIES else [*spelled, "name", *CHOICES]
+            hint = suggest(key, allowed)
+            raise ConfigError(f"unknown key {key!r}", where=where, allowed=", ".join(allowed), hint=hint)
         if name in seen:
             raise ConfigError(
                 f"{key!r} and {seen[name]!r} are the same quantity", where=where, allowed="only one of them"
             )
         seen[name] = key
-
-
-def _unknown(key: str, where: str, allowed: list[str]) -> ConfigError:
-    stem, _, unit = key.rpartition("_")
-    for name in (stem, key):
-        if name in QUANTITIES:
-            units = QUANTITIES[name].keys(name)
-            found = f"{unit!r} is not a unit of {name!r}" if name == stem else f"{name!r} needs a unit"
-            if units == [name]:
-                found = f"{name!r} has no unit"
-            return ConfigError(f"unknown key {key!r}: {found}", where=where, allowed=", ".join(units))
-    return ConfigError(f"unknown key {key!r}", where=where, allowed=", ".join(allowed), hint=suggest(key, allowed))
 
 
 def _number(document: Document, values: Mapping[str, Any], name: str, quantity: Quantity) -> float | None:

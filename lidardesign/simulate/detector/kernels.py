@@ -111,15 +111,6 @@ def even_counts(expected, offset):  # noqa: ANN001, ANN201
 
 
 @njit(cache=True, nogil=True)
-def poisson_of_rays(expected, rays, key):  # noqa: ANN001, ANN201
-    """Poisson counts of rays (R,) with these expected counts."""
-    found = np.empty(len(expected), np.int64)
-    for i in range(len(expected)):
-        found[i] = poisson_quantile(expected[i], uniform(key, rays[i], 0))
-    return found
-
-
-@njit(cache=True, nogil=True)
 def poisson_of_bins(expected, offset, rays, key, first_draw):  # noqa: ANN001, ANN201
     """Poisson counts of the bins offset[i] to offset[i + 1] of rays (R,) with these expected counts."""
     found = np.zeros(len(expected), np.int64)
@@ -229,10 +220,7 @@ def _fullest(counts, half):  # noqa: ANN001, ANN202
 
 @njit(cache=True, nogil=True)
 def _sum_around(counts, middle, half):  # noqa: ANN001, ANN202
-    total = 0
-    for b in range(max(middle - half, 0), min(middle + half, len(counts) - 1) + 1):
-        total += counts[b]
-    return total
+    return counts[max(middle - half, 0) : middle + half + 1].sum()
 
 
 @njit(cache=True, nogil=True)
@@ -264,10 +252,7 @@ def _matched(counts, shape, below, signal, level, score):  # noqa: ANN001, ANN20
         if counts[b] > 0:
             for j in range(max(-reach, b - size + 1), min(reach, b) + 1):
                 score[b - j] += counts[b] * weight[j + reach]
-    best = 0
-    for b in range(1, size):
-        if score[b] > score[best]:
-            best = b
+    best = np.argmax(score[:size])
     return best, vertex(score[:size], best)
 
 
@@ -292,9 +277,7 @@ def find_returns(counts, offset, ends, width, sigma, half, known_level, false_al
     maximum or the highest bin.
     """
     found = np.full(len(offset) - 1, np.nan)
-    longest = 0
-    for i in range(len(offset) - 1):
-        longest = max(longest, offset[i + 1] - offset[i])
+    longest = np.append(np.diff(offset), 0).max()
     shape = pulse_shape(width, sigma, longest)
     below = np.concatenate((np.zeros(1), np.cumsum(shape)))
     reach = len(shape) // 2

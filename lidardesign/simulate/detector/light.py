@@ -5,40 +5,20 @@ Beams and echoes are flat lists with the index of each entry's ray, so that a ra
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lidardesign.scenes.rays import Hits, Rays
+from lidardesign.scenes.rays import FlatLists, Hits, Rays
 from lidardesign.scenes.scene import Ambient, Scene
-
-if TYPE_CHECKING:
-    from typing import Self
 
 # First hits of rays (N, 3), (N, 3) that are sent at times (N,) [s] within the frame.
 Tracer = Callable[[np.ndarray, np.ndarray, np.ndarray], Hits]
 
 
-class Columns:
-    """Flat lists side by side, as a dataclass that holds arrays of one length alone."""
-
-    def __len__(self) -> int:
-        return len(self.ray)
-
-    def subset(self, chosen: np.ndarray | slice) -> Self:
-        """The rows at an index or mask."""
-        return type(self)(*(column[chosen] for column in vars(self).values()))
-
-    @classmethod
-    def joined(cls, parts: Sequence[Self]) -> Self:
-        """Several lists as one, one after the other."""
-        return cls(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
-
-
 @dataclass(frozen=True, eq=False)
-class Beams(Columns):
+class Beams(FlatLists):
     """Thin beams of light, B of them.
 
     Arguments:
@@ -63,7 +43,7 @@ class Beams(Columns):
 
 
 @dataclass(frozen=True, eq=False)
-class Echoes(Columns):
+class Echoes(FlatLists):
     """Light that comes back, E echoes.
 
     Arguments:
@@ -93,6 +73,11 @@ class Background:
     per_metre: np.ndarray
     edges_m: np.ndarray | None = None
     counts: np.ndarray | None = None
+
+
+def reflectances(scene: Scene, hits: Hits) -> np.ndarray:
+    """Reflectance at each hit, 0 where there is none, shape (N,)."""
+    return np.array([*(body.reflectance for body in scene.bodies), 0.0])[hits.body]
 
 
 def direct_echoes(scene: Scene, beams: Beams, hits: Hits) -> Echoes:

@@ -125,6 +125,11 @@ class Detector:
         return 1.0 if self.emitters == "shared" or rays.light is None else rays.light
 
     @property
+    def is_flood(self) -> bool:
+        """True if each pulse lights all rays of an emitter at once."""
+        return self.photons is not None and self.photons.emission == "flood"
+
+    @property
     def timing_sigma_s(self) -> float:
         """Standard deviation of a photon's time by pulse and jitter together [s]."""
         return math.hypot(self.pulse_sigma_s, self.jitter_sigma_s)

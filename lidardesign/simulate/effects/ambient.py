@@ -29,12 +29,13 @@ import numpy as np
 
 from lidardesign.numerics import safe_divide
 from lidardesign.scenes.rays import Hits, Rays
-from lidardesign.scenes.scene import SPEED_OF_LIGHT_M_S, Scene
-from lidardesign.simulate.detector.light import Background, Beams, spectral_irradiance
+from lidardesign.scenes.scene import Scene
+from lidardesign.simulate.detector.light import Background, Beams, reflectances
 from lidardesign.simulate.detector.physics import Detector
 from lidardesign.simulate.effects.expected_counts import (
     Blindness,
     Counts,
+    ambient_per_metre,
     count_text,
     missed_behind,
     unevenness,
@@ -62,16 +63,9 @@ def add_ambient(
     photons = detector.photons
     if photons is None:
         return background
-    rate_hz = np.full(len(rays), photons.dark_hz)
-    if scene.ambient is not None:
-        seen = hits.body >= 0
-        reflectance = np.zeros(len(beams))
-        reflectance[seen] = np.array([body.reflectance for body in scene.bodies])[hits.body[seen]]
-        average = np.bincount(beams.ray, weights=beams.share * reflectance, minlength=len(rays))
-        irradiance = spectral_irradiance(scene.ambient, photons.wavelength_m, photons.filter_m)
-        power_w = irradiance / math.pi * photons.filter_m * photons.aperture_m2 * photons.field_of_view_sr
-        rate_hz += average * power_w * photons.efficiency / photons.photon_energy_j
-    per_metre = background.per_metre + rate_hz * 2 / SPEED_OF_LIGHT_M_S
+    reflectance = beams.share * reflectances(scene, hits)
+    average = np.bincount(beams.ray, weights=reflectance, minlength=len(rays))
+    per_metre = background.per_metre + ambient_per_metre(scene, photons, average)
     return replace(background, per_metre=np.minimum(per_metre, MOST_PER_METRE))
 
 

@@ -25,27 +25,25 @@ import numpy as np
 
 from lidardesign.numerics import COARSE_SLACK, EPSILON, SQUARABLE, TINY, safe_divide
 from lidardesign.scenes.rays import range_of_path
-from lidardesign.scenes.scene import SPEED_OF_LIGHT_M_S
-from lidardesign.simulate.detector.light import spectral_irradiance
-from lidardesign.simulate.detector.physics import FWHM_PER_SIGMA, MOST_COUNTS, Detector, bin_width_m, metres
+from lidardesign.scenes.scene import SPEED_OF_LIGHT_M_S, Scene
+from lidardesign.simulate.detector.light import reflectances, spectral_irradiance
+from lidardesign.simulate.detector.physics import FWHM_PER_SIGMA, MOST_COUNTS, Photons, bin_width_m, metres
 from lidardesign.simulate.effects.first_hits import FirstHits
 
 # Rays pass a receiver no nearer than this share of their way: differences of arctangents are then exact to 1e-9.
 NEAREST_SHARE = COARSE_SLACK
 
 
-def ambient_per_metre(first_hits: FirstHits) -> np.ndarray:
-    """Ambient and dark counts per pulse and metre of range, shape (N,).
+def ambient_per_metre(scene: Scene, photons: Photons, reflectance: np.ndarray) -> np.ndarray:
+    """Ambient and dark counts per pulse and metre of range, by the reflectance of what is seen, shape (N,) for (N,).
 
     A hit surface has the radiance reflectance E / pi, seen through the aperture and the pixel's field of view; rays
     without a hit receive no ambient light; a metre of range takes 2 / c.
     """
-    photons, ambient = first_hits.detector.photons, first_hits.scene.ambient
-    rate_hz = np.full(len(first_hits), photons.dark_hz)
-    if ambient is not None:
-        irradiance = spectral_irradiance(ambient, photons.wavelength_m, photons.filter_m)
+    rate_hz = np.full(len(reflectance), photons.dark_hz)
+    if scene.ambient is not None:
+        irradiance = spectral_irradiance(scene.ambient, photons.wavelength_m, photons.filter_m)
         power_w = irradiance / math.pi * photons.filter_m * photons.aperture_m2 * photons.field_of_view_sr
-        reflectance = np.array([*(body.reflectance for body in first_hits.scene.bodies), 0.0])[first_hits.hits.body]
         rate_hz += reflectance * power_w * photons.efficiency / photons.photon_energy_j
     return rate_hz * 2 / SPEED_OF_LIGHT_M_S
 
@@ -107,7 +105,7 @@ def _haze_beside_rays(first_hits: FirstHits, end_m: np.ndarray, bin_m: float) ->
 LEVELS_PER_UNIT = 100
 # Counts from here on are shown as whole numbers.
 MANY = 100
-# Error of the highest bin in units of (sigma^5 / (n b))^(1/4), see `estimate_error_m`.
+# Error of the highest bin in units of (sigma^5 / (n b))^(1/4), see `Counts.error_m`.
 PEAK_STRAY = 1.5
 
 
@@ -199,7 +197,8 @@ class Counts:
     @cached_property
     def background_per_metre(self) -> np.ndarray:
         """Ambient light and dark counts per pulse and metre, shape (N,)."""
-        return ambient_per_metre(self.first_hits)
+        scene = self.first_hits.scene
+        return ambient_per_metre(scene, self.first_hits.detector.photons, reflectances(scene, self.first_hits.hits))
 
     @cached_property
     def haze_per_pulse(self) -> tuple[np.ndarray, np.ndarray]:
@@ -310,8 +309,19 @@ class Counts:
         return (self.first_hits.step_m / 2) ** 2 * matched
 
     def error_m(self, signal: np.ndarray, sigma_m: np.ndarray) -> np.ndarray:
-        """Rms range error with (N,) photons, shape (N,) [m]."""
-        return estimate_error_m(self.first_hits.detector, signal, sigma_m)
+        """Rms range error from n photons (N,) with standard deviation sigma (N,) [m], shape (N,) [m].
+
+        The matched filter averages: sigma / sqrt(n). The highest bin is a mode: it lies up to where the expected counts
+        n b f fall short of the peak's by about their own noise; with f a Gaussian, e^4 = (8 sqrt(2 pi)) sigma^5 / (n b)
+        up to a factor (Chernoff 1964: a mode converges slower than a mean), and no further than the earliest photon,
+        which the highest bin may hold where most bins hold one: sigma sqrt(1 + ln n).
+        """
+        count = np.maximum(signal, 1.0)
+        averaged = sigma_m / np.sqrt(count)
+        if self.first_hits.detector.estimator == "matched":
+            return averaged
+        mode = PEAK_STRAY * (sigma_m**5 / (count * self.bin_m)) ** 0.25
+        return np.minimum(np.maximum(averaged, mode), sigma_m * np.sqrt(1 + np.log(count)))
 
 
 def count_text(number: float) -> str:
@@ -342,22 +352,6 @@ def needed_counts(per_bin: np.ndarray, bins: np.ndarray, false_alarm: float) -> 
     # the inverse is of a smooth curve through the steps: one step more where it falls short
     needed += 1 - pdtr(needed - 1, least) > allowed
     return np.where(quiet, 1.0, np.maximum(needed, 1.0))
-
-
-def estimate_error_m(detector: Detector, signal: np.ndarray, sigma_m: np.ndarray) -> np.ndarray:
-    """Rms range error from n photons (N,) with standard deviation sigma (N,) [m], shape (N,) [m].
-
-    The matched filter averages: sigma / sqrt(n). The highest bin is a mode: it lies up to where the expected counts
-    n b f fall short of the peak's by about their own noise; with f a Gaussian, e^4 = (8 sqrt(2 pi)) sigma^5 / (n b) up
-    to a factor (Chernoff 1964: a mode converges slower than a mean), and no further than the earliest photon, which the
-    highest bin may hold where most bins hold one: sigma sqrt(1 + ln n).
-    """
-    count = np.maximum(signal, 1.0)
-    averaged = sigma_m / np.sqrt(count)
-    if detector.estimator == "matched":
-        return averaged
-    mode = PEAK_STRAY * (sigma_m**5 / (count * bin_width_m(detector))) ** 0.25
-    return np.minimum(np.maximum(averaged, mode), sigma_m * np.sqrt(1 + np.log(count)))
 
 
 def changed_share(signal: np.ndarray, fewer: np.ndarray) -> np.ndarray:

@@ -77,10 +77,6 @@ class FirstHits:
     def __len__(self) -> int:
         return len(self.rays)
 
-    def nothing(self, reason: str) -> EffectBound:
-        """Bound of an effect that changes nothing."""
-        return EffectBound(np.zeros(len(self)), np.zeros(len(self)), reason)
-
     @cached_property
     def neighbours(self) -> np.ndarray:
         """The `NEIGHBOURS` rays of the same list that end nearest to each; itself where there are fewer, (N, K)."""

@@ -3,7 +3,7 @@
 Bound of its effect (`bound`): without photons each return has one normal error, (c / 2) sigma_j rms. With n photons
 the matched filter averages them: (c / 2) sigma_j / sqrt(n), where bins are as fine; each photon may also change bins
 by itself, which adds a bin times (c / 2) sigma_j to the variance of one, and a wider pulse is located elsewhere
-between bins. The highest bin does not average; with timing errors its error is `estimate_error_m` of pulse and timing
+between bins. The highest bin does not average; with timing errors its error is `Counts.error_m` of pulse and timing
 together, and without them that of the pulse alone, so that the two differ by at most sqrt(e(sigma_p, sigma_j)^2 +
 e(sigma_p)^2). A wider echo is also lower: returns are lost where it falls below the detection threshold, or below
 background as photons leave their bins, and surfaces outside a gate spill more photons into it. Of several photons in a
@@ -21,7 +21,7 @@ import numpy as np
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Scene
 from lidardesign.simulate.detector.physics import Detector, metres
-from lidardesign.simulate.effects.expected_counts import Blindness, Counts, Echo, estimate_error_m
+from lidardesign.simulate.effects.expected_counts import Blindness, Counts, Echo
 from lidardesign.simulate.effects.first_hits import EffectBound, FirstHits
 
 
@@ -29,8 +29,6 @@ def add_timing_errors(
     path_m: np.ndarray, ray: np.ndarray, order: np.ndarray, detector: Detector, key: int
 ) -> np.ndarray:
     """Half paths with timing errors, of photons by ray and order or of whole returns, shape (K,) [m]."""
-    if detector.jitter_sigma_s == 0:
-        return path_m
     # compiled on import, which bounds do not need
     from lidardesign.simulate.detector.streams import normals
 
@@ -56,7 +54,7 @@ def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
         moved_m = np.minimum(2 * (both_m - pulse_m), first_hits.step_m)
         # and every photon with an error may change bins by itself
         strayed_m2 = metres(sigma_s) * (metres(sigma_s) + (detector.bin_m or 0.0))
-        squared = estimate_error_m(detector, signal, np.sqrt(strayed_m2)) ** 2 + moved_m**2
+        squared = counts.error_m(signal, np.sqrt(strayed_m2)) ** 2 + moved_m**2
     else:
         squared = counts.error_m(signal, both_m) ** 2 + counts.error_m(signal, pulse_m) ** 2
     squared = squared + ((both_m - pulse_m) * blind.early) ** 2

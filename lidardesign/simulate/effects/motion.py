@@ -19,7 +19,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -173,22 +172,6 @@ def _local_tracer(shape: Shape) -> tuple[LocalTracer, np.ndarray, float]:
     return trace, np.zeros(3), group.radius_m
 
 
-# The bodies that never move, as a scene of their own, so that its meshes are built once for all frames and designs.
-_still_scenes: WeakKeyDictionary[Scene, tuple[Scene, np.ndarray]] = WeakKeyDictionary()
-
-
-def _still(scene: Scene) -> tuple[SceneCaster | None, np.ndarray]:
-    """A caster of the bodies that never move, and their indices in the scene."""
-    if scene not in _still_scenes:
-        chosen = [i for i, body in enumerate(scene.bodies) if body.poses.ndim == 2 and not any(body.velocity_m_s)]
-        if not chosen:
-            return None, np.empty(0, dtype=np.int64)
-        bodies = tuple(replace(scene.bodies[i], role="both") for i in chosen)
-        _still_scenes[scene] = Scene(bodies, f"{scene.name}, what rests"), np.array(chosen)
-    part, indices = _still_scenes[scene]
-    return shared_caster(part), indices
-
-
 def still_tracer(caster: SceneCaster) -> Tracer:
     """Tracer of a scene that is static within a frame."""
     return lambda origins, directions, time_s: caster.first_hit(origins, directions)
@@ -196,16 +179,11 @@ def still_tracer(caster: SceneCaster) -> Tracer:
 
 def moving_tracer(scene: Scene, frame: int) -> Tracer:
     """Tracer of unit rays (N, 3), (N, 3) that are sent at times (N,) [s] within a frame, with bodies in motion."""
-    caster, indices = _still(scene)
-    rest = set(indices.tolist())
-    moving = [_MovingBody(scene, index, frame) for index in range(len(scene.bodies)) if index not in rest]
+    caster = shared_caster(scene, only="resting")
+    moving = [_MovingBody(scene, index, frame) for index, body in enumerate(scene.bodies) if not body.is_resting]
 
     def trace(origins: np.ndarray, directions: np.ndarray, time_s: np.ndarray) -> Hits:
-        if caster is None:
-            hits = Hits.none(len(origins))
-        else:
-            found = caster.first_hit(origins, directions)
-            hits = Hits(found.range_m, np.where(found.body >= 0, indices[found.body], -1), found.normal)
+        hits = caster.first_hit(origins, directions)
         for body in moving:
             body.keep_nearer(hits, origins, directions, time_s)
         return hits

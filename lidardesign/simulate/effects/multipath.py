@@ -51,11 +51,11 @@ from lidardesign.numerics import EPSILON_FLOAT32, safe_divide
 from lidardesign.scenes.casting import shared_caster
 from lidardesign.scenes.rays import Hits, Rays, in_view, path_windows
 from lidardesign.scenes.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Scene, Sphere
-from lidardesign.simulate.detector.light import Beams, Echoes, direct_echoes
+from lidardesign.simulate.detector.light import Beams, Echoes, direct_echoes, reflectances
 from lidardesign.simulate.detector.physics import Detector, Physics, resolution_m
 from lidardesign.simulate.effects.expected_counts import Counts
 from lidardesign.simulate.effects.first_hits import EffectBound, FirstHits
-from lidardesign.simulate.light_transport.detours import Detours, lamp_bound, pixel_bound
+from lidardesign.simulate.light_transport.detours import MOST_POINTS, WHITEST, Detours, lamp_bound, pixel_bound
 from lidardesign.simulate.light_transport.transport import Lights, PathBins, Transients, render_transient
 
 MOST_SURFACES = 6
@@ -89,12 +89,20 @@ def interreflections(scene: Scene, frame: int, rays: Rays, physics: Physics) -> 
     nothing = view.direct.subset(np.zeros(len(view.direct), dtype=bool))
     if physics.detector.photons is None and resolution_m(physics.detector) == 0:
         return nothing
-    flood = physics.detector.photons is not None and physics.detector.photons.emission == "flood"
-    by_pixel = flood or scene.receiver is None
-    if not len(view.rays) or (by_pixel and view.pixel_sr == 0):
+    is_flood = physics.detector.is_flood
+    if not len(view.rays) or ((is_flood or scene.receiver is None) and view.pixel_sr == 0):
         return nothing
-    found = view.of_a_flood() if flood else view.of_a_pixel() if by_pixel else view.of_a_receiver()
-    received_sr = view.solid_angles() if flood else np.full(len(view.rays), view.pixel_sr if by_pixel else 1.0)
+    if is_flood:
+        # each ray's spot, lit by all other spots
+        found, received_sr = view.rendered(view.spots(), bounces=MOST_SURFACES - 1), view.solid_angles()
+    elif scene.receiver is None:
+        # each ray's pixel, lit by the ray's own spot
+        received_sr = np.full(len(view.rays), view.pixel_sr)
+        found = view.rendered(view.spots(), bounces=MOST_SURFACES - 1, own_light=True, cone_sr=received_sr)
+    else:
+        # each ray's spot, lit from the receiver (by reciprocity)
+        found = view.rendered(Lights.receiver(scene.receiver), bounces=MOST_SURFACES, direct=False)
+        received_sr = np.ones(len(view.rays))
     gain = found.radiance * received_sr[found.ray]
     kept = (np.bincount(found.ray, gain, len(view.rays)) > FAINTEST_SHARE * view.direct.gain)[found.ray]
     ray, cell = found.ray[kept], found.cell[kept]
@@ -163,19 +171,6 @@ class _View:
             physics.stream("multipath", scene, frame),
         )
 
-    def of_a_flood(self) -> Transients:
-        """Radiance of each ray's spot, lit by all other spots."""
-        return self._rendered(self._spots(), bounces=MOST_SURFACES - 1)
-
-    def of_a_pixel(self) -> Transients:
-        """Radiance in each ray's pixel, lit by the ray's own spot."""
-        cone_sr = np.full(len(self.rays), self.pixel_sr)
-        return self._rendered(self._spots(), bounces=MOST_SURFACES - 1, own_light=True, cone_sr=cone_sr)
-
-    def of_a_receiver(self) -> Transients:
-        """Indirect radiance of each ray's spot, lit from the receiver (by reciprocity)."""
-        return self._rendered(Lights.receiver(self.scene.receiver), bounces=MOST_SURFACES, direct=False)
-
     def solid_angles(self) -> np.ndarray:
         """Solid angle of each flood pixel, at most that of its ray's part of the flood, shape (K,) [sr]."""
         from scipy.spatial import cKDTree
@@ -192,19 +187,20 @@ class _View:
     def _points(self) -> np.ndarray:
         return self.rays.origin_m + self.hits.range_m[:, None] * self.rays.direction
 
-    def _spots(self) -> Lights:
-        reflectance = np.array([body.reflectance for body in self.scene.bodies])[self.hits.body]
+    def spots(self) -> Lights:
+        """The spots of all rays as lights."""
+        reflectance = reflectances(self.scene, self.hits)
         half_angle_rad = max(self.detector.divergence_rad / 2, math.sqrt(self.pixel_sr / math.pi))
         return Lights.beams(self.hits, self.rays, reflectance, radius_m=half_angle_rad * self.hits.range_m)
 
-    def _rendered(self, lights: Lights, **options: object) -> Transients:
+    def rendered(self, lights: Lights, **options: object) -> Transients:
+        """Radiance along the rays' looks from these lights."""
         return render_transient(
             self.scene,
             self.frame,
             self._looks(),
             lights,
             replace(self.bins, start_m=self.start_m),
-            matt=True,
             samples=self.samples,
             seed=self.seed,
             **options,
@@ -212,9 +208,8 @@ class _View:
 
     def _looks(self) -> Rays:
         """Rays along which indirect light is rendered: from the receiver of a flood, otherwise the beams themselves."""
-        photons = self.detector.photons
         receiver = self.scene.receiver
-        if receiver is None or photons is None or photons.emission != "flood":
+        if receiver is None or not self.detector.is_flood:
             return self.rays
         away = self._points() - np.asarray(receiver.origin_m)
         origin_m = np.tile(np.asarray(receiver.origin_m, dtype=float), (len(away), 1))
@@ -222,9 +217,8 @@ class _View:
         return Rays(origin_m, direction, self.rays.gate_m, self.rays.sensor, self.rays.time_s)
 
 
-MOST_POINTS, AT_ONCE = 64, 8
-# Upper limit of the share that a bounce keeps: between white walls all around the series would not converge.
-WHITEST = 0.999
+# Rays whose shift by other spots is bounded together.
+AT_ONCE = 8
 
 
 def moved_by_spots_m(first_hits: FirstHits) -> np.ndarray:
@@ -276,10 +270,11 @@ def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
     """Bound of the effect of multipath light, the same for all rays: its rms over a sample of points."""
     rows = np.flatnonzero(first_hits.returned)
     if not len(rows):
-        return first_hits.nothing("no ray returns")
+        return EffectBound(np.zeros(len(first_hits)), np.zeros(len(first_hits)), "no ray returns")
     found = _detours(first_hits, rows)
     squared_m2 = np.mean(np.minimum(found.shift_m, first_hits.width_m[rows][found.chosen]) ** 2)
-    by_spots_m2 = np.mean(moved_by_spots_m(first_hits) ** 2) if _is_flood(first_hits) else 0.0
+    spots_shine = first_hits.detector.is_flood and first_hits.scene.receiver is None
+    by_spots_m2 = np.mean(moved_by_spots_m(first_hits) ** 2) if spots_shine else 0.0
     alone = _hidden(first_hits, rows[found.chosen]) & (found.seen > 0)
     outweighed = np.mean((found.apart > 1) | alone)
     late = 100 * found.share.mean()
@@ -309,16 +304,10 @@ def _hidden(first_hits: FirstHits, rows: np.ndarray) -> np.ndarray:
     return hidden
 
 
-def _is_flood(first_hits: FirstHits) -> bool:
-    """True for flood emission with each ray received at its origin."""
-    photons = first_hits.detector.photons
-    return first_hits.scene.receiver is None and photons is not None and photons.emission == "flood"
-
-
 def _detours(first_hits: FirstHits, rows: np.ndarray) -> Detours:
     rays, hits = first_hits.rays.subset(rows), first_hits.hits.subset(rows)
     photons, receiver = first_hits.detector.photons, first_hits.scene.receiver
-    flood = photons is not None and photons.emission == "flood"
+    flood = first_hits.detector.is_flood
     if not flood and receiver is None:
         beam_sr = math.pi * (first_hits.detector.divergence_rad / 2) ** 2
         pixel_sr = beam_sr if photons is None else max(photons.field_of_view_sr, beam_sr)

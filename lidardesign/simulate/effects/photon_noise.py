@@ -5,7 +5,7 @@ a few photons and leaves the others.
 
 Bound of its effect (`bound`): n photons of a pulse (c / 2) sigma_p wide give a range with the error (c / 2) sigma_p /
 sqrt(n) (Cramer and Rao's bound for a Gaussian without background), or that of the highest bin; see
-`estimate_error_m`. Where photons have timing errors too, other photons have other errors, and both count. The number is
+`Counts.error_m`. Where photons have timing errors too, other photons have other errors, and both count. The number is
 Poisson: the return is lost with the probability that the echo's bins hold fewer than a return needs. A pulse has a
 width: a gate's end that cuts it off moves the mean of the rest by sigma phi(z) / Phi(z), z the distance in sigma, and a
 surface outside the gate spills n Phi(-z) photons into it, which make a return with at most the probability that there
@@ -34,9 +34,9 @@ FIRST_PHOTON = 1
 def draw_numbers(expected: np.ndarray, rays: np.ndarray, key: int) -> np.ndarray:
     """Poisson counts of rays with these expected counts, shapes (R,)."""
     # compiled on import, which bounds do not need
-    from lidardesign.simulate.detector.kernels import poisson_of_rays
+    from lidardesign.simulate.detector.kernels import poisson_of_bins
 
-    return poisson_of_rays(expected, rays, np.uint64(key))
+    return poisson_of_bins(expected, np.arange(len(rays) + 1), rays, np.uint64(key), 0)
 
 
 def draw_places(ray: np.ndarray, order: np.ndarray, key: int) -> tuple[np.ndarray, np.ndarray]:

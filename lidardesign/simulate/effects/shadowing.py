@@ -96,7 +96,7 @@ def sight_shares(
 
 
 def visible_echoes(scene: Scene, beams: Beams, hits: Hits, echoes: Echoes, tracer: Tracer) -> Echoes:
-    """The direct echoes that reach the scene's receiver, attenuated by glass; all of them without a receiver.
+    """The direct echoes that reach the scene's receiver, attenuated by glass.
 
     Arguments:
         scene: Its receiver and its bodies' transmissions.
@@ -105,8 +105,6 @@ def visible_echoes(scene: Scene, beams: Beams, hits: Hits, echoes: Echoes, trace
         echoes: One echo for each of these hits, in their order.
         tracer: First hits of any rays at any time within the frame.
     """
-    if scene.receiver is None:
-        return echoes
     seen = np.flatnonzero(hits.body >= 0)
     points = beams.origin_m[seen] + hits.range_m[seen, None] * beams.direction[seen]
     share = in_view(scene.receiver, points).astype(np.float64)

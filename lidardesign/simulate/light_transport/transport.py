@@ -51,24 +51,20 @@ _BOX_QUADS = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 
 
 
 def scene_shapes(
-    scene: Scene, frame: int, centre_m: np.ndarray, reach_m: float, *, matt: bool = False
+    scene: Scene, frame: int, centre_m: np.ndarray, reach_m: float
 ) -> tuple[list[dict[str, Any]], dict[str, np.ndarray]]:
-    """Shapes of a frame as JSON, and their arrays.
+    """Shapes of a frame as JSON, and their arrays; light that is mirrored or transmitted is lost.
 
     Arguments:
         scene: The scene; all of its bodies, whatever their role.
         frame: The time frame.
         centre_m: The new origin, shape (3,) [m].
         reach_m: Distance of the furthest end or hit of a path from it [m].
-        matt: Whether light that is mirrored or transmitted is lost.
     """
     shapes, arrays = [], {}
     for number, body in enumerate(scene.bodies):
         document, own = _shape(body, frame, centre_m, reach_m)
-        shares = {"reflectance": float(body.reflectance), "specular": 0.0, "transmission": 0.0}
-        if not matt:
-            shares |= {"specular": float(body.specular), "transmission": float(body.transmission)}
-        shapes.append({**document, **shares})
+        shapes.append({**document, "reflectance": float(body.reflectance)})
         arrays.update({f"{name}{number}": values for name, values in own.items()})
     return shapes, arrays
 
@@ -211,11 +207,6 @@ class PathBins:
     count: int
     start_m: float | np.ndarray = 0.0
 
-    def __post_init__(self) -> None:
-        finite = math.isfinite(self.width_m) and np.isfinite(self.start_m).all()
-        if not (finite and self.width_m > 0 and self.count > 0):
-            raise ConfigError(f"{self}", where="bins", allowed="a finite start, a width above 0 m, one bin or more")
-
     @property
     def centres_m(self) -> np.ndarray:
         """Centres of the bins [m], shape (count,), where they start alike for all rays."""
@@ -251,7 +242,6 @@ def render_transient(
     samples: int = 1,
     seed: int = 0,
     direct: bool = True,
-    matt: bool = False,
     own_light: bool = False,
     cone_sr: np.ndarray | None = None,
 ) -> Transients:
@@ -260,32 +250,24 @@ def render_transient(
     Arguments:
         scene: The scene.
         frame: The time frame.
-        rays: The viewing rays, N of them; gates are ignored.
-        lights: The lights, M of them.
+        rays: The viewing rays, N of them, at least one; gates are ignored.
+        lights: The lights, M of them, at least one.
         bins: Bins of path length.
         bounces: Most surfaces on a path: 1 is the direct component, exact for thin rays, one light, one sample.
         samples: Light paths per ray; standard errors fall with its root.
         seed: Seed of the simulator's random numbers; a ray's depend on its index in the list, and on samples and bins.
         direct: Whether to include light reflected by a single surface.
-        matt: Whether light that is mirrored or transmitted is lost.
         own_light: Whether ray n sees light n alone; otherwise all of them.
         cone_sr: Solid angle around each ray over which radiance is averaged [sr], shape (N,); None: thin rays.
 
     Raises:
-        ConfigError: The simulator is not usable here, or numbers that are not allowed.
+        ConfigError: The simulator is not usable here.
         NumericalError: It died or took too long.
     """
     count = len(rays)
-    if bounces < 1 or samples < 1:
-        raise ConfigError(f"{bounces} bounces, {samples} samples", where="light transport", allowed="1 or more")
-    if own_light and count != len(lights):
-        raise ConfigError(f"{len(lights)} lights of {count} rays", where="own_light", allowed="one for each ray")
-    if not count or not len(lights):
-        nothing = np.zeros(0, dtype=np.int64)
-        return Transients(bins, nothing, nothing, np.zeros(0), np.zeros(count))
     first = shared_caster(scene, frame).first_hit(rays.origin_m, rays.direction)
     centre_m, reach_m = _neighbourhood(first, rays, lights)
-    shapes, arrays = scene_shapes(scene, frame, centre_m, reach_m, matt=matt)
+    shapes, arrays = scene_shapes(scene, frame, centre_m, reach_m)
     origin = rays.origin_m - centre_m
     columns = {
         "origin": origin,
@@ -395,10 +377,8 @@ def missing() -> str | None:
         if tuple(int(part) for part in re.findall(r"\d+", found)[:2]) < oldest:
             return f"{name} {found} is too old: {'.'.join(map(str, oldest))} or newer is needed"
     if llvm_library() is None:
-        named = os.environ.get(LLVM_VARIABLE)
-        if named:
-            return f"{LLVM_VARIABLE} names {named}, which is not an LLVM library of version {OLDEST_LLVM} or newer"
-        return f"no LLVM library of version {OLDEST_LLVM} or newer was found"
+        place = os.environ.get(LLVM_VARIABLE) or "where systems have it"
+        return f"no LLVM library of version {OLDEST_LLVM} or newer: {place}"
     return None
 
 

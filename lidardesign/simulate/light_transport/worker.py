@@ -18,7 +18,6 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from lidardesign.numerics import TINY_FLOAT32
 from lidardesign.run.child import write_line
 
 RAY_COLUMNS = ("origin", "direction", "cone_cosine_m1", "baseline", "dark_place", "dark_radius")
@@ -167,18 +166,8 @@ def _lights(mi: Any, dr: Any) -> type:
 def _shapes(mi: Any, request: dict[str, Any], arrays: dict[str, np.ndarray]) -> dict[str, Any]:
     made: dict[str, Any] = {}
     for number, shape in enumerate(request["shapes"]):
-        # Matt, mirroring and clear shares of a body's light as one material, the same on both sides
-        clear, mirror = shape["transmission"], shape["specular"]
-        solid = max(1.0 - clear, TINY_FLOAT32)
-        matt_share = max(solid - mirror, TINY_FLOAT32)
-        material: dict[str, Any] = {"type": "diffuse", "reflectance": {"type": "uniform", "value": 1.0}}
-        material["reflectance"]["value"] = min(shape["reflectance"] / matt_share, 1.0)
-        if mirror > 0:
-            glossy = {"type": "conductor", "material": "none"}
-            material = {"type": "blendbsdf", "weight": mirror / solid, "matt": material, "glossy": glossy}
-        material = {"type": "twosided", "inner": material}
-        if clear > 0:
-            material = {"type": "mask", "opacity": 1.0 - clear, "inner": material}
+        matt = {"type": "diffuse", "reflectance": {"type": "uniform", "value": shape["reflectance"]}}
+        material = {"type": "twosided", "inner": matt}
         name = f"body{number}"
         if shape["kind"] == "mesh":
             made[name] = _mesh(mi, name, material, arrays[f"vertices{number}"], arrays[f"faces{number}"])
