@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from importlib.resources import files
+from importlib.util import find_spec
 from pathlib import Path
 
 from lidardesign import __version__, registry
@@ -46,6 +47,8 @@ def new_task(name: str, folder: Path | None = None) -> list[Path]:
         raise ConfigError(f"{name!r} is not a name for a task", where="NAME", allowed=allowed)
     if name in registry.task_names():
         raise ConfigError(f"a task {name!r} is installed already", where="NAME", hint="choose another name")
+    if find_spec(f"lidardesign_{name}") is not None:
+        raise ConfigError(f"a module lidardesign_{name} is installed already", where="NAME", hint="choose another name")
     tokens = {
         "name": name,
         "package": f"lidardesign-{name.replace('_', '-')}",
