@@ -48,7 +48,6 @@ LOADS = (
 CALL_SECONDS = 60.0
 # The geometry and the scores of so many training scenes are looked at.
 LOOKED_AT = 3
-DEEPEST = 40  # nesting of a value that has a digest
 # Fields of scenes and bodies without effect on rays, or compared in another way.
 UNSEEN = ("name", "group", "notes", "truth", "bodies", "poses", "importance")
 # So often rays at targets are drawn until they are enough; of a scene that moves, so many frames are aimed at.
@@ -214,8 +213,6 @@ class Subject:
     def __post_init__(self) -> None:
         self.seconds: dict[str, float] = {}
         self._scenes: dict[tuple[Split, int], list[Scene]] = {}
-        self._as_made: list[str] = []
-        self._casters: dict[int, list[SceneCaster]] = {}
         self._rays: dict[tuple[int, int], list[Rays]] = {}
 
     @contextlib.contextmanager
@@ -249,12 +246,11 @@ class Subject:
             self._scenes[key] = self.new_scenes(*key)
         return self._scenes[key]
 
-    @property
+    @cached_property
     def looked_at(self) -> list[Scene]:
         """The first training scenes, which the laws check."""
         scenes = self.scenes("train")[:LOOKED_AT]
-        if not self._as_made:
-            self._as_made = [fingerprint(scene) for scene in scenes]
+        self._as_made = [fingerprint(scene) for scene in scenes]
         return scenes
 
     def touched(self) -> list[str]:
@@ -279,16 +275,15 @@ class Subject:
         with self.calling("conditions"):
             return conditions_of(self.task, self.config.task, self.config.space)
 
-    def casters(self, number: int) -> list[SceneCaster]:
-        """One caster per frame of a scene that is looked at, by its number."""
-        if number not in self._casters:
-            self._casters[number] = build_casters(self.looked_at[number])
-        return self._casters[number]
+    @cached_property
+    def casters(self) -> list[list[SceneCaster]]:
+        """One caster per frame of every scene that is looked at."""
+        return [build_casters(scene) for scene in self.looked_at]
 
     def rays(self, number: int, count: int) -> list[Rays]:
         """Up to so many rays at what can be seen of a scene's targets, for each condition value."""
         if (number, count) not in self._rays:
-            scene, casters, space = self.looked_at[number], self.casters(number), self.config.space
+            scene, casters, space = self.looked_at[number], self.casters[number], self.config.space
             self._rays[number, count] = [
                 rays_at_targets(scene, space.at(condition), casters, count) for condition in self.conditions
             ]
@@ -296,7 +291,7 @@ class Subject:
 
     def returns(self, number: int, lists: Sequence[Rays]) -> list[Returns]:
         """Returns of rays in a scene that is looked at: for each condition value all frames, as `score` gets them."""
-        scene, casters = self.looked_at[number], self.casters(number)
+        scene, casters = self.looked_at[number], self.casters[number]
         return [frame for rays in lists for frame in simulate(scene, rays, casters=casters)]
 
     def score(self, scene: Scene, returns: Sequence[Returns]) -> Score:
@@ -311,7 +306,7 @@ def fingerprint(value: Any) -> str:
     Objects of other kinds count by their type and attributes; cached properties of dataclasses do not count.
     """
     digest = hashlib.sha256()
-    _add(digest, value, DEEPEST)
+    _add(digest, value)
     return digest.hexdigest()
 
 
@@ -324,9 +319,7 @@ def _others(of: Body | Scene) -> list[Any]:
     return [getattr(of, field.name) for field in fields(of) if field.name not in UNSEEN]
 
 
-def _add(digest: Any, value: Any, depth: int) -> None:
-    if depth == 0:
-        raise ValueError("values are nested too deeply, or hold themselves")
+def _add(digest: Any, value: Any) -> None:
     digest.update(f"<{type(value).__qualname__}>".encode())
     if isinstance(value, np.ndarray) and value.dtype != object:
         digest.update(f"{value.dtype.str}{value.shape}".encode())
@@ -335,7 +328,7 @@ def _add(digest: Any, value: Any, depth: int) -> None:
         digest.update(repr(value).encode())
     else:
         for part in _parts(value):
-            _add(digest, part, depth - 1)
+            _add(digest, part)
     digest.update(b"</>")
 
 

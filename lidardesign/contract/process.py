@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 from lidardesign import registry
 from lidardesign.config import resolve
-from lidardesign.contract.law import CALL_SECONDS, LOADS, Finding, Law, error_words, place_of, restore_random_states
+from lidardesign.contract.law import CALL_SECONDS, LOADS, Finding, error_words, place_of, restore_random_states
 from lidardesign.errors import ConfigError, DataError, LidardesignError
 from lidardesign.run.child import START_SECONDS, Child, ChildError, write_line
 
@@ -84,7 +84,7 @@ def check_in_process(request: CheckRequest) -> Iterator[Finding]:
 
 def _read_findings(child: Child, seconds: float) -> Iterator[Finding]:
     """Findings as they arrive; where the child is lost, the law under trial does not hold."""
-    for number in range(len(_laws()) + 1):
+    for number in range(len(_statements())):
         found = _next_finding(child, seconds, loading=number == 0)
         if isinstance(found, str):
             yield from _all_lost(number, found)
@@ -132,25 +132,20 @@ def _finding(found: dict[str, Any]) -> Finding:
 
 def _all_lost(number: int, reason: str) -> Iterator[Finding]:
     """A failure of law `number` (0: the plugin loads), and findings that later laws were not reached."""
-    name, group, statement = LOADS if number == 0 else _named(number)
-    yield Finding(name, group, statement, "fail", reason)
+    yield Finding(*_statements()[number], "fail", reason)
     yield from _not_reached(number + 1)
 
 
 def _not_reached(number: int) -> Iterator[Finding]:
-    for later in range(number, len(_laws()) + 1):
-        yield Finding(*_named(later), "skip", "not reached")
+    for one in _statements()[number:]:
+        yield Finding(*one, "skip", "not reached")
 
 
-def _laws() -> Sequence[Law]:
+def _statements() -> list[tuple[str, str, str]]:
+    """Name, group and statement of what comes before all laws, then of each law."""
     from lidardesign.contract.contract import LAWS
 
-    return LAWS
-
-
-def _named(number: int) -> tuple[str, str, str]:
-    law = _laws()[number - 1]
-    return law.name, law.group, law.statement
+    return [LOADS, *((law.name, law.group, law.statement) for law in LAWS)]
 
 
 def answer_check(request: dict[str, Any], result: BinaryIO) -> dict[str, Any]:
@@ -159,7 +154,7 @@ def answer_check(request: dict[str, Any], result: BinaryIO) -> dict[str, Any]:
     contract = _begin(request, result)
     if contract is None:
         return {}
-    os.chdir(_make_folder(request, "work"))
+    os.chdir(tempfile.mkdtemp(dir=request["folder"]))
     for finding in contract.findings():
         write_line(result, finding.as_dict())
     return {}
@@ -167,14 +162,8 @@ def answer_check(request: dict[str, Any], result: BinaryIO) -> dict[str, Any]:
 
 def _settle(request: dict[str, Any]) -> None:
     """Set a folder for temporary files, and keep Python from writing bytecode next to the plugin's sources."""
-    tempfile.tempdir = os.environ["TMPDIR"] = _make_folder(request, "temporary")
+    tempfile.tempdir = os.environ["TMPDIR"] = tempfile.mkdtemp(dir=request["folder"])
     os.environ["PYTHONDONTWRITEBYTECODE"], sys.dont_write_bytecode = "1", True
-
-
-def _make_folder(request: dict[str, Any], name: str) -> str:
-    path = Path(request["folder"]) / name
-    path.mkdir()
-    return str(path)
 
 
 def _begin(request: dict[str, Any], result: BinaryIO) -> Contract | None:

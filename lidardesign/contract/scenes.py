@@ -6,6 +6,7 @@ Scenes are reproducible, splits share none, and scenes can be sent to other proc
 from __future__ import annotations
 
 import importlib
+import json
 import math
 import os
 import pickle
@@ -14,7 +15,6 @@ from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from pydantic import ValidationError
 
 from lidardesign.config import PRESETS, resolve
 from lidardesign.contract.law import (
@@ -165,8 +165,6 @@ def check_picklable(subject: Subject) -> LawHolds:
         try:
             content = pickle.dumps(scene)
             again = pickle.loads(content)
-        except LidardesignError:
-            raise
         except Exception as error:
             what = getattr(scene, "name", "the configuration")
             raise BrokenLawError(f"{what!r} cannot be pickled: {type(error).__name__}: {error}") from error
@@ -205,16 +203,10 @@ SCENE_LAWS = (
 
 
 def check_config(subject: Subject) -> LawHolds:
-    """Unknown keys and NaN are refused, values survive JSON, every key has a description."""
+    """Values survive JSON, and every key has a description."""
     kind, config = type(subject.config.task), subject.config.task
     with subject.calling("Config"):
-        if _takes(kind, {**config.model_dump(), "no_such_key": 1}):
-            raise BrokenLawError("takes a key that it does not know", hint="keep extra='forbid' of TaskConfig")
-        numbers = [name for name, value in config if isinstance(value, int | float)]
-        taken = [name for name in numbers if _takes(kind, {**config.model_dump(), name: float("nan")})]
         again = kind(**config.model_dump(mode="json"))
-    if taken:
-        raise BrokenLawError(f"takes NaN for {taken[0]!r}", hint="keep allow_inf_nan=False of TaskConfig")
     if again.model_dump() != config.model_dump():
         raise BrokenLawError("values change in a round trip through JSON, in which runs are kept")
     mute = [name for name, info in kind.model_fields.items() if not info.description]
@@ -223,14 +215,6 @@ def check_config(subject: Subject) -> LawHolds:
             f"{mute[0]!r} has no description", hint="Field(default, description=...); `tasks show` prints it"
         )
     return LawHolds(f"{len(kind.model_fields)} keys", {"keys": len(kind.model_fields)})
-
-
-def _takes(kind: type, values: dict[str, object]) -> bool:
-    try:
-        kind(**values)
-    except ValidationError:
-        return False
-    return True
 
 
 def check_metric(subject: Subject) -> LawHolds:
@@ -273,21 +257,17 @@ def check_defaults(subject: Subject) -> LawHolds:
     unknown = [preset for preset in defaults.learning if preset not in PRESETS]
     if unknown:
         raise BrokenLawError(f"defaults.learning has the preset {unknown[0]!r}", allowed=", ".join(PRESETS))
-    task = {f"task.{name}": value for name, value in subject.config.task.model_dump(mode="json").items()}
+    # JSON is YAML too
+    values = subject.config.task.model_dump(mode="json")
+    task = [f"task.{name}={json.dumps(value)}" for name, value in values.items()]
     for preset in PRESETS:
         try:
             with restore_random_states(subject.drawn, "space"):
-                resolve(subject.task, preset=preset, overrides=[f"{key}={_as_yaml(v)}" for key, v in task.items()])
+                resolve(subject.task, preset=preset, overrides=task)
         except ConfigError as error:
             raise BrokenLawError(f"preset {preset}: {error.message}", allowed=error.allowed) from error
     rays = ", ".join(map(str, defaults.rays))
     return LawHolds(f"level {defaults.level:g}, evaluated at {rays} rays")
-
-
-def _as_yaml(value: object) -> str:
-    import json
-
-    return json.dumps(value)
 
 
 def _is_count(value: object) -> bool:
@@ -295,13 +275,9 @@ def _is_count(value: object) -> bool:
 
 
 def check_space(subject: Subject) -> LawHolds:
-    """`space` gives a DesignSpace, the same one every time, with a dimension to design."""
+    """`space` gives the same DesignSpace every time, with a dimension to design."""
     with subject.calling("space"):
         first, again = (subject.task.space(subject.config.task) for _ in range(2))
-    for space in (first, again):
-        if not isinstance(space, DesignSpace):
-            found = type(space).__name__
-            raise BrokenLawError(f"space() returned {found}", allowed="lidardesign.space.DesignSpace")
     if first.as_dict() != again.as_dict():
         raise BrokenLawError("space() returned a different one the second time", allowed="the same every time")
     designed = len(set(subject.config.space.free) - set(subject.config.space.conditioned))
@@ -320,9 +296,9 @@ def check_conditions(subject: Subject) -> LawHolds | NotApplicable:
 
 INTERFACE_LAWS = (
     Law(
-        "configuration is strict",
+        "configuration is described",
         "interface",
-        "Config refuses unknown keys and NaN, survives JSON and describes every key",
+        "Config survives JSON and describes every key",
         check_config,
     ),
     Law("metric is defined", "interface", "the metric has a unit, a direction and bounds", check_metric),

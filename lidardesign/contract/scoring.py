@@ -38,13 +38,9 @@ def _worse(subject: Subject, value: float, than: float) -> float:
     return value - than if subject.metric.better == "lower" else than - value
 
 
-def _scenes(subject: Subject) -> list[tuple[int, Scene]]:
-    return list(enumerate(subject.looked_at))
-
-
 def check_reach(subject: Subject) -> LawHolds:
     """Rays of the design space meet targets in every checked scene."""
-    counts = [sum(map(len, subject.rays(number, DENSE))) for number, _ in _scenes(subject)]
+    counts = [sum(map(len, subject.rays(number, DENSE))) for number in range(len(subject.looked_at))]
     if not min(counts):
         raise BrokenLawError(
             f"no ray from the design space meets a target of scene {subject.looked_at[counts.index(0)].name!r}",
@@ -56,7 +52,7 @@ def check_reach(subject: Subject) -> LawHolds:
 def check_number(subject: Subject) -> LawHolds:
     """Returns of dense, of sparse and of random rays are scored by a finite number or fail."""
     values = []
-    for number, scene in _scenes(subject):
+    for number, scene in enumerate(subject.looked_at):
         space, generator = subject.config.space, np.random.default_rng([SEED, number])
         anywhere = [full_rays(space.at(one).sample(DENSE, generator), space) for one in subject.conditions]
         for lists in (subject.rays(number, DENSE), subject.rays(number, SPARSE), anywhere):
@@ -71,7 +67,7 @@ def check_number(subject: Subject) -> LawHolds:
 def check_nothing(subject: Subject) -> LawHolds:
     """No rays and rays without returns are scored, and no better than returns."""
     found = []
-    for number, scene in _scenes(subject):
+    for number, scene in enumerate(subject.looked_at):
         none = [rays.subset(np.zeros(0, dtype=int)) for rays in subject.rays(number, SPARSE)]
         silent = without_returns(_dense(subject, number))
         dense = subject.score(scene, _dense(subject, number))
@@ -93,7 +89,7 @@ def check_nothing(subject: Subject) -> LawHolds:
 def check_best(subject: Subject) -> LawHolds:
     """Many exact returns from targets score at least as well as few, and better than none."""
     dense, sparse, none = [], [], []
-    for number, scene in _scenes(subject):
+    for number, scene in enumerate(subject.looked_at):
         returns = _dense(subject, number)
         dense.append(subject.score(scene, returns).value)
         sparse.append(subject.score(scene, subject.returns(number, subject.rays(number, SPARSE))).value)
@@ -114,7 +110,7 @@ def check_best(subject: Subject) -> LawHolds:
 def check_order(subject: Subject) -> LawHolds:
     """The order in which rays are listed does not matter."""
     worst = 0.0
-    for number, scene in _scenes(subject):
+    for number, scene in enumerate(subject.looked_at):
         returns = _dense(subject, number)
         value = subject.score(scene, returns).value
         other = subject.score(scene, shuffled(returns, np.random.default_rng([SEED, number]))).value
@@ -128,7 +124,7 @@ def check_order(subject: Subject) -> LawHolds:
 
 def check_repeats(subject: Subject) -> LawHolds:
     """The same returns have the same score every time, to the bit."""
-    for number, scene in _scenes(subject):
+    for number, scene in enumerate(subject.looked_at):
         returns = _dense(subject, number)
         first, again = subject.score(scene, returns), subject.score(scene, returns)
         if fingerprint(first) != fingerprint(again):
@@ -138,7 +134,7 @@ def check_repeats(subject: Subject) -> LawHolds:
 
 def check_untouched(subject: Subject) -> LawHolds:
     """Scoring changes neither the scene nor the returns."""
-    for number, scene in _scenes(subject):
+    for number, scene in enumerate(subject.looked_at):
         returns = _dense(subject, number)
         heard = fingerprint(returns)
         subject.score(scene, returns)
@@ -155,7 +151,7 @@ def check_information(subject: Subject) -> LawHolds | NotApplicable:
     if not informs_rays(subject.task):
         return NotApplicable("the task has no method informs, so rays of its designs cannot be chosen")
     pairs, rays = 0, 0
-    for number, scene in _scenes(subject):
+    for number, scene in enumerate(subject.looked_at):
         dense = _dense(subject, number)
         # one list of candidates is fired everywhere, also where fewer rays see something
         order = np.random.default_rng([SEED, number]).permutation(min(len(one.rays) for one in dense))

@@ -138,20 +138,16 @@ def _check_bytes(path: Path, head: bytes) -> None:
         return
     if not head.strip():
         raise DataError("is empty", where=str(path), allowed=ALLOWED[kind])
-    if head.startswith(UTF16_MARKS) and kind == XML:
-        return
     try:
         # a letter may be cut at the end
         codecs.getincrementaldecoder("utf-8")().decode(head)
-        is_text = True
+        is_text = b"\0" not in head
     except UnicodeDecodeError:
-        is_text = False
-    if is_text and b"\0" not in head:
-        return
-    if kind == CSV and b"\0" not in head:
-        raise DataError("is not UTF-8 text", where=str(path), allowed=ALLOWED[kind], hint="save it as UTF-8")
-    found = {CSV: "is not CSV: it holds bytes that are not text", NPZ: "is not an NPZ archive", XML: "is not XML"}[kind]
-    raise DataError(f"{found}, or is damaged", where=str(path), allowed=ALLOWED[kind])
+        is_text = kind == XML and head.startswith(UTF16_MARKS)
+    if not is_text:
+        found = {CSV: "is not UTF-8 text", NPZ: "is not an NPZ archive", XML: "is not XML"}[kind]
+        hint = "save it as UTF-8" if kind == CSV else None
+        raise DataError(f"{found}, or is damaged", where=str(path), allowed=ALLOWED[kind], hint=hint)
 
 
 def _check_text(path: Path, texts: list[tuple[int, str]]) -> None:

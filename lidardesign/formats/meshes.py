@@ -13,6 +13,7 @@ of 20 mm along the boresight; its far face is 16 mm wide at the bottom and 8 mm 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -60,11 +61,14 @@ def write_ply(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     notes = [*write_folder(path, files), "weights and origin covariances of the sensors are lost"]
     if len(seen) < len(design.sensors):
         notes.append(f"{len(design.sensors) - len(seen)} of {len(design.sensors)} sensors have no width, so no frustum")
-    regions = [sensor.region_m for _, sensor in seen if sensor.region_m > 0]
-    if regions:
-        wide = f"regions with a standard deviation of up to {max(regions):.3g} m"
-        notes.append(f"{len(regions)} sensors are {wide}: frusta stand in their middles")
-    return notes
+    return [*notes, *_region_notes([sensor for _, sensor in seen], "frusta")]
+
+
+def _region_notes(sensors: Sequence[Sensor], drawn: str) -> list[str]:
+    """A note of the sensors that are regions, of which only the middles are drawn."""
+    regions = [sensor.region_m for sensor in sensors if sensor.region_m > 0]
+    wide = f"regions with a standard deviation of up to {max(regions, default=0.0):.3g} m"
+    return [f"{len(regions)} sensors are {wide}: {drawn} stand in their middles"] if regions else []
 
 
 def ply_file(comments: list[str], **elements: np.ndarray) -> bytes:
@@ -150,15 +154,11 @@ KEYWORDS = ("solid", "facet", "loop", "vertex")
 def write_stl(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     """Write the file, atomically; returns notes of what the format cannot hold."""
     write_atomic(path, "".join(_solid(index, sensor) for index, sensor in enumerate(design.sensors)))
-    notes = [
+    return [
         "numbers are millimetres: STL has no units, and CAD programs take that one",
         "sensors only: rays, fields of view, gates and weights are lost",
+        *_region_notes(design.sensors, "solids"),
     ]
-    regions = [sensor.region_m for sensor in design.sensors if sensor.region_m > 0]
-    if regions:
-        wide = f"regions with a standard deviation of up to {max(regions):.3g} m"
-        notes.append(f"{len(regions)} sensors are {wide}: solids stand in their middles")
-    return notes
 
 
 def _solid(index: int, sensor: Sensor) -> str:

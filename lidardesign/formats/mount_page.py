@@ -6,11 +6,9 @@ source says of a part stands there as unknown.
 
 from __future__ import annotations
 
-import csv
 import html
-import io
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -24,6 +22,7 @@ from lidardesign.formats.robots import WORLD, fixed_link
 from lidardesign.numerics import EPSILON
 from lidardesign.parts.catalogue import parts_of
 from lidardesign.parts.part import Part
+from lidardesign.run.arrays import csv_table
 from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.sensor import Sensor, boresight_frame, boresight_of
@@ -132,9 +131,10 @@ def write_mounts(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     mounted = mounted_parts(design)
     parent = WORLD if design.mount is None else design.mount
     frame = "world" if design.mount is None else f"body {design.mount}"
+    rows = [one.row(frame) for one in mounted]
     files = {
         "mounts.html": _page(design, mounted, frame, parent).encode(),
-        "mounts.csv": _csv([one.row(frame) for one in mounted]).encode(),
+        "mounts.csv": csv_table([rows[0], *(row.values() for row in rows)]).encode(),
         "mounts.urdf": document(_urdf(design, mounted, parent)),
         "static_transforms.sh": "".join(f"{line} &\n" for line in _transforms(mounted, parent)).encode() + b"wait\n",
     }
@@ -153,14 +153,6 @@ def write_mounts(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
             f"the part files of {', '.join(missing)} are not available: poses are those of the middles of their fields"
         )
     return [*notes, "sensors only: rays are lost; --format csv lists them"]
-
-
-def _csv(rows: Sequence[Mapping[str, Any]]) -> str:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
 
 
 def _urdf(design: DesignSpec, mounted: Sequence[MountedPart], parent: str) -> Any:
@@ -304,11 +296,13 @@ ANGLES = (
 def _page(design: DesignSpec, mounted: Sequence[MountedPart], frame: str, parent: str) -> str:
     """The page to print."""
     title = f"Mounting {design.name}"
+    of_world = "the <b>world's</b> frame: x forward, y to the left, z up"
+    of_robot = f"the frame of <b>{html.escape(frame)}</b>, as the robot's model has it"
     views = "".join(_sketch(mounted, *view) for view in VIEWS)
     commands = html.escape("\n".join(_transforms(mounted, parent)))
     body = [
         f"<p>{len(mounted)} {'sensor' if len(mounted) == 1 else 'sensors'}. Places and directions are in "
-        f"{_frame_text(frame)}. Numbers are rounded; "
+        f"{of_world if design.mount is None else of_robot}. Numbers are rounded; "
         "<code>mounts.csv</code> has all digits. No design of this program has been built in hardware yet.</p>",
         "<h2>Where, and which way</h2>", _poses(mounted), f"<p>{ANGLES}</p>",
         '<div class="views">', views, "</div>",
@@ -323,13 +317,6 @@ def _page(design: DesignSpec, mounted: Sequence[MountedPart], frame: str, parent
         f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n<style>{STYLE}</style>\n</head>\n<body>\n'
         f"<h1>{html.escape(title)}</h1>\n{''.join(body)}\n</body>\n</html>\n"
     )
-
-
-def _frame_text(frame: str) -> str:
-    """The frame of a page, as markup."""
-    if frame == "world":
-        return "the <b>world's</b> frame: x forward, y to the left, z up"
-    return f"the frame of <b>{html.escape(frame)}</b>, as the robot's model has it"
 
 
 def _poses(mounted: Sequence[MountedPart]) -> str:

@@ -96,29 +96,23 @@ def write_folder(path: Path, files: Mapping[str, bytes]) -> list[str]:
 
 
 def element(
-    tag: str, attributes: Mapping[str, str] | None = None, children: Iterable[Element] = (), text: str | None = None
+    tag: str, attributes: Mapping[str, object] | None = None, children: Iterable[Element] = (), text: object = None
 ) -> Element:
-    """XML element with attributes, children and text; invalid characters are replaced."""
-    made = Element(tag, {name: xml_text(value) for name, value in (attributes or {}).items()})
-    made.text = None if text is None else xml_text(text)
+    """XML element with attributes, children and text; numbers have all digits, invalid characters are replaced."""
+    made = Element(tag, {name: _plain(value) for name, value in (attributes or {}).items()})
+    made.text = None if text is None else _plain(text)
     made.extend(children)
     return made
 
 
-def number(value: float) -> str:
-    """A number with all its digits, as text."""
-    return repr(float(value))
-
-
 def numbers(values: Iterable[float]) -> str:
     """Numbers with all their digits, separated by spaces."""
-    return " ".join(map(number, values))
+    return " ".join(repr(float(value)) for value in values)
 
 
 def child(parent: Element, tag: str, text: object = None, **attributes: object) -> Element:
-    """An element at the end of its parent; numbers are written with all their digits."""
-    made = element(tag, {name: _plain(value) for name, value in attributes.items()})
-    made.text = None if text is None else xml_text(_plain(text))
+    """An element at the end of its parent."""
+    made = element(tag, attributes, text=text)
     parent.append(made)
     return made
 
@@ -126,7 +120,7 @@ def child(parent: Element, tag: str, text: object = None, **attributes: object) 
 def _plain(value: object) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
-    return number(value) if isinstance(value, float) else str(value)
+    return numbers([value]) if isinstance(value, float) else xml_text(str(value))
 
 
 def document(root: Element) -> bytes:

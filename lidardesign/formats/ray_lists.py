@@ -12,10 +12,9 @@ elevation_sigma (to first order in the spread, without roll). `time` is the one-
 
 from __future__ import annotations
 
-import csv
 import io
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -24,7 +23,7 @@ import numpy as np
 from lidardesign.errors import DataError
 from lidardesign.formats.rig import MOST_SENSORS, Rig, RigSensor, number_of
 from lidardesign.numerics import COARSE_SLACK, SLACK
-from lidardesign.run.arrays import NUMERIC_KINDS, csv_rows, read_npz
+from lidardesign.run.arrays import NUMERIC_KINDS, csv_rows, csv_table, read_npz
 from lidardesign.run.files import write_atomic
 from lidardesign.run.inputs import RAY_TABLE
 from lidardesign.scenes.rays import Rays
@@ -418,11 +417,9 @@ def _sensor(row: dict[str, float], index: int, where: str) -> Sensor:
     )
 
 
-def write_sensor_csv(design: DesignSpec, path: Path) -> list[str]:
-    """Write a sensor table with its header, atomically; returns what the table cannot hold."""
-    buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(SENSOR_COLUMNS)
+def write_sensor_csv(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
+    """Write a sensor table with its header, atomically, without any rays; returns what the table cannot hold."""
+    table: list[Sequence[str]] = [SENSOR_COLUMNS]
     lost = {
         "the patterns of rays are lost": bool(design.patterns),
         "roll is lost: spreads are those along azimuth and elevation":
@@ -453,12 +450,6 @@ def write_sensor_csv(design: DesignSpec, path: Path) -> list[str]:
             *sensor.origin_m, sensor.azimuth_rad, sensor.elevation_rad, (start + end) / 2, *upper,
             azimuth_sigma, elevation_sigma, (end - start) / (2 * z), sensor.weight,
         ]  # fmt: skip
-        writer.writerow([repr(float(value)) for value in row])
-    write_atomic(Path(path), buffer.getvalue())
-    return notes
-
-
-def write_sensors_csv(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
-    """Write the sensors of an export, not its rays; returns notes of what the format cannot hold."""
-    notes = write_sensor_csv(design, path)
+        table.append([repr(float(value)) for value in row])
+    write_atomic(Path(path), csv_table(table))
     return [*notes, f"the {len(rays)} rays are lost"] if len(rays) else notes

@@ -184,11 +184,6 @@ def _gate_m(rays: Rays, place: Place) -> tuple[float, float]:
     return float(gate[:, 0].min()), float(gate[:, 1].max())
 
 
-def _bins(rays: Rays, place: Place) -> int:
-    start, end = _gate_m(rays, place)
-    return int(Bandwidth().bins(end - start))
-
-
 def _scene(place: Place, rays: Rays) -> Element:
     """Scene of a place: integrator, rays with their film, and light."""
     root = element("scene", {"version": "3.0.0"})
@@ -212,10 +207,10 @@ def _scene(place: Place, rays: Rays) -> Element:
 
 def _add_film(batch: Element, place: Place, rays: Rays) -> None:
     """Append a film with a pixel per ray and their common gate as optical path lengths."""
-    start, _ = _gate_m(rays, place)
+    start, end = _gate_m(rays, place)
     film = child(batch, "film", type="transient_hdr_film")
     for name, value in (
-        ("width", len(place.ray)), ("height", 1), ("temporal_bins", _bins(rays, place)),
+        ("width", len(place.ray)), ("height", 1), ("temporal_bins", int(Bandwidth().bins(end - start))),
     ):  # fmt: skip
         child(film, "integer", name=name, value=value)
     child(film, "float", name="start_opl", value=2 * start)

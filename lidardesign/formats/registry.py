@@ -136,7 +136,7 @@ EXPORTERS: dict[str, Exporter] = {
             ".sensors.csv",
             "one sensor per row, the 16 columns of the research code",
             "lidardesign.formats.ray_lists",
-            "write_sensors_csv",
+            "write_sensor_csv",
             reader="the research code of the paper",
             checked="read as a design; the columns are those of its own files",
         ),

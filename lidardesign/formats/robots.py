@@ -48,7 +48,6 @@ from lidardesign.formats.names import (
     document,
     element,
     identifier,
-    number,
     numbers,
     renamed_note,
     xml_text,
@@ -172,7 +171,7 @@ def _sites(places_m: np.ndarray, directions: np.ndarray, names: np.ndarray) -> l
     return [
         element(
             "site",
-            {"name": str(name), "pos": numbers(place), "quat": numbers(turn), "size": number(SITE_SIZE_M)},
+            {"name": str(name), "pos": numbers(place), "quat": numbers(turn), "size": SITE_SIZE_M},
         )
         for name, place, turn in zip(names, places_m, turns, strict=True)
     ]
@@ -182,8 +181,8 @@ def _rangefinder(site: str, rays: Rays, ray: int, rate_hz: float) -> Element:
     start, end = rays.gate_m[ray]
     user = numbers([start, end, rays.sensor[ray], rays.time_s[ray]])
     # a cutoff of 0 means none; without a number of samples MuJoCo ignores the interval
-    rate = {"nsample": "1", "interval": number(1 / rate_hz)} if rate_hz else {}
-    return element("rangefinder", {"name": site, "site": site, "cutoff": number(max(end, SLACK)), "user": user, **rate})
+    rate = {"nsample": "1", "interval": 1 / rate_hz} if rate_hz else {}
+    return element("rangefinder", {"name": site, "site": site, "cutoff": max(end, SLACK), "user": user, **rate})
 
 
 LINK = "lidar"
@@ -228,7 +227,7 @@ def sensor_element(mount: Mount, rate_hz: float, *, posed: bool, name: str | Non
     grid = grid_of(mount)
     start, end = max(mount.gate_m[0], NEAREST_M), max(mount.gate_m[1], NEAREST_M)
     axes = [_axis("horizontal", grid.columns, grid.azimuth_rad), _axis("vertical", grid.rows, grid.elevation_rad)]
-    interval = [element("min", text=number(start)), element("max", text=number(end))]
+    interval = [element("min", text=start), element("max", text=end)]
     lidar = element("lidar", children=[element("scan", children=axes), element("range", children=interval)])
     return element(
         "sensor",
@@ -236,7 +235,7 @@ def sensor_element(mount: Mount, rate_hz: float, *, posed: bool, name: str | Non
         [
             *([element("pose", text=numbers([*mount.origin_m, *mount.roll_pitch_yaw_rad]))] if posed else []),
             element("topic", text=f"/{name or mount.name}"),
-            element("update_rate", text=number(rate_hz)),
+            element("update_rate", text=float(rate_hz)),
             element("always_on", text="true"),
             element("visualize", text="true"),
             lidar,
@@ -250,8 +249,8 @@ def _axis(name: str, samples: int, bounds_rad: tuple[float, float]) -> Element:
         children=[
             element("samples", text=str(samples)),
             element("resolution", text="1"),
-            element("min_angle", text=number(bounds_rad[0])),
-            element("max_angle", text=number(bounds_rad[1])),
+            element("min_angle", text=bounds_rad[0]),
+            element("max_angle", text=bounds_rad[1]),
         ],
     )
 

@@ -302,8 +302,6 @@ def _axis(element: ElementTree.Element, scope: Scope, notes: dict[str, None], wi
     resolution = element.find("resolution")
     if resolution is not None and numbers_of(resolution.text, 1, scope.where(resolution), "resolution")[0] != 1:
         notes["resolution is ignored: Gazebo interpolates between the rays that are fired, `samples` of them"] = None
-    if samples == 1 and low < high:
-        notes["a scan of one sample points along its min_angle, as in Gazebo"] = None
     return np.linspace(low, high, int(samples))
 
 

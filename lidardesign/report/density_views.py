@@ -112,18 +112,15 @@ class PlaneDensity:
     others: np.ndarray
 
 
-def density_view(
-    samples: Samples, scene: Scene, designs: Sequence[DesignSpec] = (), frame: int | None = None
-) -> DensityView:
+def density_view(samples: Samples, scene: Scene, designs: Sequence[DesignSpec] = ()) -> DensityView:
     """The views of a density: marginals, with those of designs, and projections of its observed points.
 
     Arguments:
         samples: Weighted samples of it.
-        scene: The scene under the projections.
+        scene: The scene under the projections, at its middle frame.
         designs: Designs with marginals to compare.
-        frame: Of the scene; the one in the middle by default.
     """
-    moment = scene.frames // 2 if frame is None else frame
+    moment = scene.frames // 2
     planes, effective = plane_densities(samples, scene, moment), effective_count(samples.weights)
     return DensityView(marginals(samples, designs), planes, len(samples), effective, scene.name, moment)
 

@@ -116,13 +116,6 @@ def log_ticks(values: Sequence[float]) -> list[float]:
     return [tick for tick in ticks if low / TICK_MARGIN <= tick <= high * TICK_MARGIN]
 
 
-def axis_titles(evaluation: Evaluation, against: Against) -> tuple[str, str]:
-    """Titles of the horizontal and the vertical axis, with their units."""
-    metric = evaluation.metric
-    up = f"{metric.name} [{metric.unit}], {metric.better} is better"
-    return ("rays" if against == "rays" else "bandwidth [Mbit/s]"), up
-
-
 def far_baselines(evaluation: Evaluation) -> set[str]:
     """Names of baselines far worse than all designs at every number of rays, to hide at first in a plot."""
     sign, baseline = (1.0 if evaluation.metric.better == "lower" else -1.0), evaluation.strongest_baseline
@@ -141,8 +134,9 @@ def curve_figure(evaluation: Evaluation, against: Against, hidden: Collection[st
 
     At one number of rays there are bars instead.
     """
-    curves = series(evaluation)
-    across, up = axis_titles(evaluation, against)
+    curves, metric = series(evaluation), evaluation.metric
+    across = "rays" if against == "rays" else "bandwidth [Mbit/s]"
+    up = f"{metric.name} [{metric.unit}], {metric.better} is better"
     rows = [row for curve in curves for row in curve.rows]
     places = [position(row, against) for row in rows]
     ends = [end for curve in curves if curve.name not in hidden for row in curve.rows for end in row.drawn_interval]
@@ -150,7 +144,7 @@ def curve_figure(evaluation: Evaluation, against: Against, hidden: Collection[st
     numbered = {"tickvals": sorted(set(places)), "tickformat": "~g"} if against == "rays" else {"tickformat": "~g"}
     ticks = {"type": "category", "automargin": True} if has_bars else {**_scale(places), **numbered}
     # shares are compared by what is between them, and bars by their lengths
-    is_linear = has_bars or evaluation.metric.unit == "%"
+    is_linear = has_bars or metric.unit == "%"
     values = {"type": "linear"} if is_linear else _scale([row.value for row in rows], ends)
     axis = {"gridcolor": "#e4e7eb", "zeroline": False, "linecolor": "#9aa5b1", "ticks": "outside"}
     layout = {

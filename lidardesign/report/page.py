@@ -118,12 +118,13 @@ def evaluation_report(
     if samples is not None:
         view = density_view(samples, shown.scene, request.designs)
         points = observed_point(samples.resample(DENSITY_POINTS, random_generator(config.seed, "report")))
-    learned = manifest.get("command")
-    commands = [("The run that was learned", _line(learned))] if isinstance(learned, list) and learned else []
-    commands.append(("The scores and this page", _line(command)))
+    made_by = {"The run that was learned": manifest.get("command"), "The scores and this page": list(command)}
+    commands = [
+        (what, shlex.join(map(str, words))) for what, words in made_by.items() if isinstance(words, list) and words
+    ]
     facts = [
         ("task", config.task_name),
-        ("seed of the scenes", str(request.held_out_seed)),
+        ("seed of the scenes", str(request.seed if request.scenes_seed is None else request.scenes_seed)),
         ("seed of the run", str(config.seed)),
         *((f"design {design.name}", _origin(design.provenance)) for design in request.designs),
         *((f"version of {name}", version) for name, version in versions().items()),
@@ -154,10 +155,6 @@ def _origin(provenance: Mapping[str, object]) -> str:
     elsewhere = ("versions", "task", "run")
     told = [f"{name} {value}" for name, value in provenance.items() if name not in elsewhere]
     return ", ".join(told) or "made by hand"
-
-
-def _line(words: Sequence[object]) -> str:
-    return shlex.join(str(word) for word in words)
 
 
 def write_report(report: Report, path: Path) -> None:

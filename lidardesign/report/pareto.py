@@ -75,19 +75,9 @@ class Panel:
     errors: tuple[float, float]
 
     @property
-    def shows_tolerance(self) -> bool:
-        """True where the tolerance has a place on the axis."""
-        return self.errors[0] <= self.sweep.tolerance <= self.errors[1]
-
-    @property
     def front(self) -> list[Mark]:
         """The marks of the Pareto front, the fastest first."""
         return sorted((mark for mark in self.marks if not mark.beaten), key=lambda mark: (mark.x, -mark.y))
-
-    @property
-    def error_title(self) -> str:
-        """The title of the vertical axis: the error with its unit."""
-        return f"error [{self.sweep.unit}]" if self.sweep.unit else "error [share]"
 
 
 def panels(sweeps: Sequence[Sweep]) -> list[Panel]:
@@ -111,13 +101,6 @@ def _spanned(low: float, high: float) -> tuple[float, float]:
     """Ends of a logarithmic axis around two values, at least `LEAST_SPAN` long."""
     factor = BEYOND * math.sqrt(max(LEAST_SPAN / (high / low), 1.0))
     return low / factor, high * factor
-
-
-def has_fine_ticks(ends: tuple[float, float]) -> bool:
-    """True for an axis between ends that needs ticks between the powers of ten."""
-    low, high = ends
-    powers = math.floor(math.log10(high)) - math.ceil(math.log10(low)) + 1
-    return high < FINE_TICKS_SPAN * low or powers < 2
 
 
 def _mark(measurement: Measurement, least_seconds: float, errors: tuple[float, float], sweep: Sweep) -> Mark:
@@ -188,9 +171,11 @@ def _pareto_figure(panel: Panel) -> dict[str, Any]:
         "hovermode": "closest",
         "annotations": [_title(panel), *_settings(panel)],
         "xaxis": _pareto_axis(panel.seconds, "seconds"),
-        "yaxis": _pareto_axis(panel.errors, html.escape(panel.error_title)),
+        "yaxis": _pareto_axis(panel.errors, html.escape(f"error [{panel.sweep.unit or 'share'}]")),
     }
-    return {"data": [*([_tolerance(panel)] if panel.shows_tolerance else []), line, _marks(panel)], "layout": layout}
+    low, high = panel.errors
+    tolerance = [_tolerance(panel)] if low <= panel.sweep.tolerance <= high else []
+    return {"data": [*tolerance, line, _marks(panel)], "layout": layout}
 
 
 def _marks(panel: Panel) -> dict[str, Any]:
@@ -258,13 +243,15 @@ def _hover_text(mark: Mark, sweep: Sweep) -> str:
 
 
 def _pareto_axis(ends: tuple[float, float], title: str) -> dict[str, Any]:
+    low, high = ends
+    powers = math.floor(math.log10(high)) - math.ceil(math.log10(low)) + 1
     return {
         "type": "log",
         "gridcolor": "#e4e7eb",
         "linecolor": "#9aa5b1",
         "ticks": "outside",
         "zeroline": False,
-        "dtick": "D2" if has_fine_ticks(ends) else 1,
+        "dtick": "D2" if high < FINE_TICKS_SPAN * low or powers < 2 else 1,
         "range": [math.log10(end) for end in ends],
         "tickformat": "~g",
         "tickfont": {"size": 10},

@@ -168,8 +168,8 @@ def table(
     lines: Sequence[tuple[list[str], str, bool]],
     *,
     text_columns: int,
+    caption: str,
     words: Mapping[str, str] = VERDICT_WORDS,
-    caption: str = "",
 ) -> str:
     """An HTML table; a line is its cells, a verdict for the last cell (in `words`), and whether a group begins."""
     head = "".join(
@@ -185,11 +185,9 @@ def table(
             shown[-1] = f'<td class="{word}">{words[word]}</td>'
         body += f"<tr{' class=first' if first else ''}>{''.join(shown)}</tr>"
     title = html.escape(caption)
-    named = f' role="region" aria-label="{title}"' if title else ""
-    heading = f"<caption><span>{title}</span></caption>" if title else ""
     return (
-        f'<div class="scroll" tabindex="0"{named}><table>{heading}<thead><tr>{head}</tr></thead><tbody>{body}</tbody>'
-        "</table></div>"
+        f'<div class="scroll" tabindex="0" role="region" aria-label="{title}"><table><caption><span>{title}</span>'
+        f"</caption><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
     )
 
 
@@ -384,7 +382,7 @@ def audit_section(evaluation: Evaluation, audit: Audit) -> str:
 
 
 def _starts(rows: Sequence[AuditRow], index: int) -> bool:
-    row, before = rows[index], rows[index - 1]
+    row, before = rows[index].planned, rows[index - 1].planned
     if row.matched_to is None:
         return row.design != before.design
     return (row.matched_to, row.matched_rays) != (before.matched_to, before.matched_rays)
@@ -398,9 +396,10 @@ def _effect_cells(effect: EffectSummary) -> list[str]:
     return [_words(effect.name), simulated, effect.reason, *bounds, plain_number(effect.seconds, 2, tiny=SHORT_S)]
 
 
-def _audit_cells(row: AuditRow) -> list[str]:
+def _audit_cells(audited: AuditRow) -> list[str]:
+    row, other = audited.planned, audited.everything
     name = row.design if row.matched_to is None else f"{row.design} (bandwidth of {row.matched_to})"
-    cells = [name, str(row.rays), four_digits(row.planned), four_digits(row.everything), f"{row.difference:.2g}"]
-    known = row.ci_low is not None and row.ci_high is not None
-    interval = f"{row.ci_low:.2g} to {row.ci_high:.2g}" if known else "-"
-    return [*cells, interval, f"{row.seconds:.2f}", f"{row.seconds_everything:.2f}", ""]
+    cells = [name, str(row.rays), four_digits(row.value), four_digits(other.value), f"{audited.difference:.2g}"]
+    known = audited.ci_low is not None and audited.ci_high is not None
+    interval = f"{audited.ci_low:.2g} to {audited.ci_high:.2g}" if known else "-"
+    return [*cells, interval, f"{row.seconds:.2f}", f"{other.seconds:.2f}", ""]

@@ -1,4 +1,4 @@
-"""Archives of numpy arrays and rows of CSV, read without running anything in them.
+"""Archives of numpy arrays and rows of CSV, read without running anything in them; and CSV as it is written.
 
 The header of every array is read first: objects (pickles) are refused, and so is an array with less data than its shape
 needs, for which numpy would allocate memory before it finds the data missing.
@@ -12,7 +12,7 @@ import math
 import sys
 import warnings
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import BinaryIO, TypeVar
 
@@ -154,3 +154,10 @@ def csv_rows(path: Path, kind: Kind) -> list[tuple[int, list[str]]]:
     except csv.Error as error:
         raise DataError(f"is not CSV: {error}", where=f"{path}:{reader.line_num}") from None
     return rows
+
+
+def csv_table(rows: Iterable[Iterable[object]]) -> str:
+    """The text of a CSV file of rows of cells, the header first."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue()

@@ -159,14 +159,10 @@ def checked_score(task: Task, metric: Metric, scene: Scene, returns: Sequence[Re
         score = task.score(scene, returns)
     if not isinstance(score, Score):
         raise PluginError(f"score returned {type(score).__name__}", where=where, allowed="lidardesign.task.Score")
-    if not isinstance(score.details, Mapping) or not all(isinstance(name, str) for name in score.details):
+    items = score.details.items() if isinstance(score.details, Mapping) else [(None, None)]
+    if not all(isinstance(name, str) and _is_number(value) for name, value in items):
         raise PluginError(
             f"score returned the details {score.details!r}", where=where, allowed="numbers by name, as {'seen': 3.0}"
-        )
-    bad = [name for name, value in score.details.items() if not _is_number(value)]
-    if bad:
-        raise PluginError(
-            f"score returned the detail {bad[0]!r}: {score.details[bad[0]]!r}", where=where, allowed="a number"
         )
     if score.failed:
         return Score(float(metric.worst), failed=True, details=dict(score.details))
@@ -234,10 +230,6 @@ class ScenePass:
     planner: Planner
     plans: Sequence[EffectPlan] = ()
 
-    def known(self, number: int) -> EffectPlan | None:
-        """The known plan of a scene, else None."""
-        return self.plans[number] if self.plans else None
-
 
 @dataclass(frozen=True, eq=False)
 class SceneScores:
@@ -268,8 +260,8 @@ def score_scenes(
     """
     found, total = [], len(scenes.scenes)
     asked = (
-        (scenes.task, scenes.metric, scene, list(scenes.fired(n)), scenes.planner, scenes.known(n), scenes.seed)
-        for n, scene in enumerate(scenes.scenes)
+        (scenes.task, scenes.metric, scene, list(scenes.fired(n)), scenes.planner, plan, scenes.seed)
+        for n, (scene, plan) in enumerate(zip(scenes.scenes, scenes.plans or [None] * total, strict=True))
     )
     results = iter(starmap(score_in_scene, asked))
     for number, scene in enumerate(scenes.scenes):

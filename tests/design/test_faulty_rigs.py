@@ -52,7 +52,7 @@ FAULTS = {
     "comment": ("rig.csv", f"# made by hand\n{GOOD}".encode(), "begins with a comment"),
     "no header": ("rig.csv", "\n".join(ROWS).encode(), "line 1 has numbers and no names of columns"),
     "no header, names": ("rig.csv", b"left,0.5,0,0,60,0\nleft,0.5,0,0,90,0\n", "line 1 has numbers and no names"),
-    "noise csv": ("rig.csv", noise(), "is not CSV"),
+    "noise csv": ("rig.csv", noise(), "is not UTF-8 text"),
     "noise sdf": ("rig.sdf", noise(), "is not XML"),
     "noise npz": ("rig.npz", noise(), "is not an NPZ archive"),
     "cut npz": ("rig.npz", archive()[:-30], "is not an .npz file, or is cut short"),

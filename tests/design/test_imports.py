@@ -522,7 +522,7 @@ def test_what_an_sdf_file_says_beyond_a_design_is_told(tmp_path):
     text = f'<model name="m"><link name="a">{extra}</link><link name="b">{two}</link></model>'
     design = load_sdf(tmp_path, text, reach_m=3.0)
     notes = "\n".join(design.provenance["notes"])
-    for said in ("noise is ignored", "resolution is ignored", "min_angle, as in Gazebo", "gates start", "3 m"):
+    for said in ("noise is ignored", "resolution is ignored", "gates start", "3 m"):
         assert said in notes
     # one ray along min_angle, and names that say where each is
     assert [sensor.name for sensor in design.sensors] == ["m::a::eye", "m::b::eye"]

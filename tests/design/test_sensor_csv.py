@@ -49,7 +49,7 @@ def normal_gate(mean, spread):
 @given(design=designs())
 def test_sensors_come_back_from_the_table(design, tmp_path_factory):
     path = tmp_path_factory.mktemp("csv") / "table.csv"
-    write_sensor_csv(design, path)
+    write_sensor_csv(design, (), path)
     loaded = load_design(path)
     assert loaded.name == "table"
     for before, after in zip(design.sensors, loaded.sensors, strict=True):
@@ -115,7 +115,7 @@ def test_the_moving_robots_variant_is_read_at_one_position_and_refused_at_severa
 
 def test_straight_down_is_written_with_the_azimuth_spread_cut_at_a_turn(tmp_path):
     sensor = normal_sensor("down", azimuth_rad=0.5, elevation_rad=-math.pi / 2, spread_rad=(0.2, 0.1))
-    notes = write_sensor_csv(DesignSpec("d", (sensor,)), tmp_path / "d.csv")
+    notes = write_sensor_csv(DesignSpec("d", (sensor,)), (), tmp_path / "d.csv")
     assert any("pole" in note for note in notes)
     loaded = load_design(tmp_path / "d.csv").sensors[0]
     assert np.isfinite(loaded.field_of_view_rad[0])
@@ -125,7 +125,7 @@ def test_straight_down_is_written_with_the_azimuth_spread_cut_at_a_turn(tmp_path
 
 def test_a_quarter_turn_of_roll_swaps_the_spreads_and_is_noted(tmp_path):
     sensor = normal_sensor("r", roll_rad=math.pi / 2, spread_rad=(0.2, 0.1))
-    notes = write_sensor_csv(DesignSpec("d", (sensor,)), tmp_path / "d.csv")
+    notes = write_sensor_csv(DesignSpec("d", (sensor,)), (), tmp_path / "d.csv")
     assert any("roll" in note for note in notes)
     loaded = load_design(tmp_path / "d.csv").sensors[0]
     assert spreads_of(loaded) == pytest.approx((0.1, 0.2))

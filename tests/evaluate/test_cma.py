@@ -274,7 +274,8 @@ def test_a_search_ends_when_its_time_is_up(monkeypatch):
     now = itertools.count()
     monkeypatch.setattr(cma, "time", SimpleNamespace(perf_counter=lambda: float(next(now))))
     candidate = candidate_of("even", CmaSettings(60.0))
-    record = candidate.record_of(candidate.positions([], 12))
+    candidate.positions([], 12)
+    _, record = candidate.searches[12]
     assert 60 <= record.seconds <= 70
     assert record.candidates > 1
 

@@ -35,7 +35,7 @@ from lidardesign.run.manifest import start_manifest
 from lidardesign.scenes.scene import Body, Box, Mesh, Receiver, Scene, Sphere, rigid
 from lidardesign.scoring.accuracy import fields
 from lidardesign.scoring.accuracy import training as learning_steps
-from lidardesign.scoring.accuracy.fields import LOG_OPAQUE, ExactField, fresh_table, opaque_target
+from lidardesign.scoring.accuracy.fields import LOG_OPAQUE, exact_distances, fresh_table, opaque_target
 from lidardesign.scoring.accuracy.probes import AccuracyRequest, draw_probes, few_columns, with_frames
 from lidardesign.scoring.evaluation.request import EvaluationRequest
 from lidardesign.space import DesignSpace
@@ -209,21 +209,21 @@ class TestComparedFields:
         pose = rigid(trimesh.transformations.rotation_matrix(0.7, (1, 2, 3))[:3, :3], (0.1, 0.2, -0.1))
         half = (0.3, 0.4, 0.5)
         scene = Scene((Body(box_mesh(*half), poses=pose),))
-        found = ExactField([scene], lambda body: body.is_target).distances(self.POINTS)[:, 0]
+        found = exact_distances([scene], self.POINTS)[:, 0]
         local = (self.POINTS - pose[:3, 3]) @ pose[:3, :3]
         assert found == pytest.approx(shape_distance(Box(half))(local), abs=1e-12)
 
     def test_exact_distances_mix_meshes_and_primitives_and_follow_motion(self):
         poses = np.stack([rigid(translation_m=(x, 0, 0)) for x in (-0.5, 0.5)])
         scene = Scene((Body(box_mesh(0.1, 0.1, 0.1), poses=poses), Body(Sphere(0.2))))
-        found = ExactField([scene], lambda body: body.is_target).distances(self.POINTS)
+        found = exact_distances([scene], self.POINTS)
         for frame, x in enumerate((-0.5, 0.5)):
             box = shape_distance(Box((0.1, 0.1, 0.1)))(self.POINTS - (x, 0, 0))
             assert found[:, frame] == pytest.approx(np.minimum(box, shape_distance(Sphere(0.2))(self.POINTS)))
 
     def test_an_open_mesh_has_no_inside(self):
         sheet = Mesh(np.array([[0.0, -9, -9], [0, 9, -9], [0, 0, 9]]), np.array([[0, 1, 2]]), "unsigned")
-        found = ExactField([Scene((Body(sheet),))], lambda body: True).distances(self.POINTS)[:, 0]
+        found = exact_distances([Scene((Body(sheet),))], self.POINTS)[:, 0]
         assert found == pytest.approx(np.abs(self.POINTS[:, 0]))
 
     def test_a_fresh_table_is_the_table_of_learning(self):

@@ -262,7 +262,7 @@ def test_details_are_means_over_the_scenes_that_give_them():
     assert row.details == {"hit": 2.5, "even": 2.0}
     assert row.as_dict()["details"] == row.details
     for details in ({"hit": "many"}, {3: 1.0}, [1.0], None):
-        with pytest.raises(PluginError, match="score returned the detail"):
+        with pytest.raises(PluginError, match="score returned the details"):
             evaluate(make_request(task=BrokenTask(Score(1.0, details=details))))
 
 

@@ -7,7 +7,7 @@ import pytest
 from support.evaluations import make_evaluation
 from support.sensors import normal_sensor
 
-from lidardesign.report.figures import COLOURS, axis_titles, log_ticks, logarithmic, series
+from lidardesign.report.figures import COLOURS, curve_figure, log_ticks, logarithmic, series
 from lidardesign.report.scene_figure import constraint_slack_of
 from lidardesign.scoring.evaluation.results import csv_text, write_csv
 from lidardesign.sensors.design import DesignSpec
@@ -34,8 +34,9 @@ def test_series_differ_in_more_than_colour():
 
 
 def test_axes_name_their_units_and_direction():
-    titles = ("bandwidth [Mbit/s]", "Chamfer distance [mm], lower is better")
-    assert axis_titles(make_evaluation(), "bandwidth") == titles
+    layout = curve_figure(make_evaluation(), "bandwidth")["layout"]
+    assert layout["xaxis"]["title"]["text"] == "bandwidth [Mbit/s]"
+    assert layout["yaxis"]["title"]["text"] == "Chamfer distance [mm]<br>lower is better"
 
 
 def test_logarithmic_axes_need_positive_values_over_a_wide_span():

@@ -121,7 +121,7 @@ def sensor_tables(folder: Path) -> list[bytes]:
     """Sensor tables with and without their header, and with a position."""
     found = []
     for design in sample_designs()[:4:3]:
-        write_sensor_csv(design, folder / "table.csv")
+        write_sensor_csv(design, (), folder / "table.csv")
         content = (folder / "table.csv").read_bytes()
         header, *rows = content.decode().splitlines()
         placed = "\n".join([f"{QUERY_COLUMN},{header}", *(f"0.5,{row}" for row in rows)])

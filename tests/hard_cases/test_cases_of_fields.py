@@ -27,7 +27,7 @@ from lidardesign.density.objective.visibility import NoVisibility, Optics
 from lidardesign.errors import DataError
 from lidardesign.scenes.mesh_files import SUFFIXES, check_mesh, load_mesh, signed_volume_m3, unique_rows
 from lidardesign.scenes.scene import Body, Box, Capsule, Mesh, Scene, Sphere, rigid
-from lidardesign.scoring.accuracy.fields import ExactField
+from lidardesign.scoring.accuracy.fields import exact_distances
 from lidardesign.space import DesignSpace
 
 BALL = trimesh.creation.icosphere(subdivisions=2, radius=0.5)
@@ -242,7 +242,7 @@ class TestMeshesWithoutAnInside:
         faces[chosen] = faces[chosen, ::-1]
         points = probes_of(vertices)
         inside, agreed = inside_by_rays(vertices, faces, points)
-        found = ExactField([Scene((Body(check_mesh(vertices, faces)),))], lambda body: True).distances(points)[:, 0]
+        found = exact_distances([Scene((Body(check_mesh(vertices, faces)),))], points)[:, 0]
         np.testing.assert_array_equal((found < 0)[agreed], inside[agreed])
 
     def test_of_two_parts_one_inside_out_both_have_their_inside(self):
@@ -251,7 +251,7 @@ class TestMeshesWithoutAnInside:
         mesh = check_mesh(vertices, faces, sign="winding")
         points = probes_of(vertices, count=300)
         expected = ((points % 3 < 1) & (points > 0)).all(axis=1) & (points[:, 0] < 4) & (points[:, 1:] < 1).all(axis=1)
-        found = ExactField([Scene((Body(mesh),))], lambda body: True).distances(points)[:, 0] < 0
+        found = exact_distances([Scene((Body(mesh),))], points)[:, 0] < 0
         np.testing.assert_array_equal(found, expected)
         assert expected.mean() > 0.1
 
@@ -260,7 +260,7 @@ class TestMeshesWithoutAnInside:
         faces = np.vstack([BALL.faces, BALL.faces[:, ::-1] + len(BALL.vertices)])
         mesh = check_mesh(vertices, faces)
         radii = np.array([0.05, 0.2, 0.3, 0.4, 0.6])
-        found = ExactField([Scene((Body(mesh),))], lambda body: True).distances(radii[:, None] * [[1.0, 0, 0]])
+        found = exact_distances([Scene((Body(mesh),))], radii[:, None] * [[1.0, 0, 0]])
         np.testing.assert_array_equal(found[:, 0] < 0, [False, False, True, True, False])
 
     def test_a_surface_with_one_side_is_unsigned_with_a_note(self):
@@ -311,7 +311,7 @@ def asked_of(name):
     if name == "frames":
         bodies = collect_bodies([moving], lambda body: True, resolution=32, padding_m=0.1)
         return lambda p: near_pairs(bodies, p, np.zeros(2), 1.0, 1e9).distances[::2]
-    return lambda p: ExactField([ball], lambda body: True).distances(p)[:, 0]
+    return lambda p: exact_distances([ball], p)[:, 0]
 
 
 WAYS = ("primitive", "table", "table without kernels", "moving", "frames", "exact")

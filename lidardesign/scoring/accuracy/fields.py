@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -126,7 +126,7 @@ class FieldCase:
         rays = RayBatch.of(probes.points)
         everywhere = np.ones((len(probes.points), len(frames)), dtype=bool)
         passed = target.visibility.transmittance(rays, everywhere, target.optics, differentiable=False)
-        exact = ExactField(few, lambda body: body.is_target).distances(rays.observed)
+        exact = exact_distances(few, rays.observed)
         return cls(few, scenes, settings, target, probes, rays.observed, passed.log_values, exact)
 
     def log_density(self, distances: np.ndarray) -> np.ndarray:
@@ -168,45 +168,32 @@ def fresh(few: list[Scene], scenes: list[Scene], resolution: int, settings: Dens
         grid = grid_around(mesh.bounds_m, resolution, padding_m)
         return grid, distance_grid(mesh, grid)
 
-    columns = scene_columns(few)
-    entries = [
+    return BodyField(place_bodies(_targets(few), len(scene_columns(few)), build))
+
+
+def _targets(scenes: Sequence[Scene]) -> list[tuple[int, Body, int]]:
+    """Column, body and frame of every target of all scenes, one column per scene and frame."""
+    return [
         (column, body, frame)
-        for column, (index, frame) in enumerate(columns)
-        for body in few[index].bodies
+        for column, (index, frame) in enumerate(scene_columns(scenes))
+        for body in scenes[index].bodies
         if body.is_target
     ]
-    return BodyField(place_bodies(entries, len(columns), build))
 
 
-class ExactField:
-    """The exact distances of the chosen bodies of all scenes: to meshes by libigl, triangle by triangle.
-
-    Arguments:
-        scenes: One column per scene and frame.
-        chosen: Predicate of the bodies to include.
-    """
-
-    def __init__(self, scenes: Sequence[Scene], chosen: Callable[[Body], bool]) -> None:
-        entries = [
-            (column, body, frame)
-            for column, (index, frame) in enumerate(scene_columns(scenes))
-            for body in filter(chosen, scenes[index].bodies)
-        ]
-        self.columns = len(scene_columns(scenes))
-        self._meshes = [entry for entry in entries if isinstance(entry[1].shape, Mesh)]
-        others = [entry for entry in entries if not isinstance(entry[1].shape, Mesh)]
-        self._others = BodyField(place_bodies(others, self.columns, _no_grid)) if others else None
-
-    def distances(self, points: np.ndarray) -> np.ndarray:
-        """Distances at points: (N, 3) to (N, columns) [m]."""
-        out = np.full((len(points), self.columns), np.inf)
-        if self._others is not None:
-            out = self._others.distances(points)
-        for column, body, frame in self._meshes:
-            to_body = inverse_rigid(body.pose(frame))
-            local = points @ to_body[:3, :3].T + to_body[:3, 3]
-            out[:, column] = np.minimum(out[:, column], mesh_distances(body.shape, local))
-        return out
+def exact_distances(scenes: Sequence[Scene], points: np.ndarray) -> np.ndarray:
+    """The exact distances of targets at points, (N, 3) to (N, columns) [m]: to meshes by libigl, by their triangles."""
+    columns, meshes, others = len(scene_columns(scenes)), [], []
+    for entry in _targets(scenes):
+        (meshes if isinstance(entry[1].shape, Mesh) else others).append(entry)
+    out = np.full((len(points), columns), np.inf)
+    if others:
+        out = BodyField(place_bodies(others, columns, _no_grid)).distances(points)
+    for column, body, frame in meshes:
+        to_body = inverse_rigid(body.pose(frame))
+        local = points @ to_body[:3, :3].T + to_body[:3, 3]
+        out[:, column] = np.minimum(out[:, column], mesh_distances(body.shape, local))
+    return out
 
 
 def _no_grid(mesh: Mesh) -> tuple:
@@ -278,7 +265,7 @@ def visibility_sweep(case: VisibilityCase, points: int, default: str, note: str 
     return density_sweep(
         knob="density.visibility",
         against="opaque geometry, by exact first hits",
-        work=case.work,
+        work=f"log p* with its gradient at {min(case.batch, len(case.probes.points))} design points",
         measurements=[case.measure(name, *way, default=name == default) for name, way in ways.items()],
         note=note,
     )
@@ -357,11 +344,6 @@ class VisibilityCase:
         _, seconds, memory = timed(lambda: target.log_density_and_gradient(batch))
         errors = probes.misplaced(target.log_density(probes.points), exact)
         return Measurement(setting, *errors, seconds, memory, default=default)
-
-    @property
-    def work(self) -> str:
-        """The work that is timed."""
-        return f"log p* with its gradient at {min(self.batch, len(self.probes.points))} design points"
 
 
 def opaque_target(target: Target) -> Target:

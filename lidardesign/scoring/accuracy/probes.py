@@ -14,6 +14,9 @@ from lidardesign.density.fields.distance import scene_columns
 from lidardesign.density.objective.prepare import prepare_target
 from lidardesign.density.objective.proposals import independent_points
 from lidardesign.density.objective.target import Target
+from lidardesign.density.training.learn import FLOW
+from lidardesign.density.training.learned import LearningSteps, load_flow
+from lidardesign.density.training.losses import Pool
 from lidardesign.density.training.quality import misplaced_share
 from lidardesign.run.manifest import read_manifest
 from lidardesign.scenes.scene import Scene
@@ -30,6 +33,7 @@ ERROR_OF = "share of the density's mass in the wrong place"
 FRAMES_OF_FEW = 4
 # Few draws at a time: each call chooses from candidates of its own, which many draws would exhaust.
 DRAWN_AT_ONCE = 4096
+POOL = 8192  # points that steps of learning draw from
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +56,16 @@ class AccuracyRequest:
     def target(self) -> Target:
         """The target of all training scenes as the run learned it."""
         return prepare_target(list(self.request.train), self.config, visibility=self.decided_visibility)[0]
+
+    @cached_property
+    def steps(self) -> LearningSteps | None:
+        """The steps of the run's learning at its learned flow; None where no probe reaches a surface."""
+        config, target = self.config, self.target
+        probes = draw_probes(target, POOL, config.seed, "steps")
+        if not len(probes.points):
+            return None
+        pool = Pool.of(config.space.to_unit(probes.points), target.log_density(probes.points), probes.log_proposal)
+        return LearningSteps(load_flow(self.run, FLOW, config, target, config.seed).flow, target, config.learning, pool)
 
     @property
     def decided_visibility(self) -> str | None:

@@ -4,25 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from lidardesign.density.training.learn import FLOW
 from lidardesign.density.training.learned import (
     DTYPES,
     LearningSteps,
     Loss,
     gradient,
     in_arithmetic,
-    load_flow,
     noise_share,
     noise_shares,
     remeasured,
 )
-from lidardesign.density.training.losses import Pool
 from lidardesign.density.training.quality import draw_probes as draw_independent_probes
-from lidardesign.scoring.accuracy.probes import AccuracyRequest, density_sweep, draw_probes
+from lidardesign.scoring.accuracy.probes import AccuracyRequest, density_sweep
 from lidardesign.scoring.sweep import Measurement, Sweep, timed
 from lidardesign.task import random_generator
 
@@ -36,10 +32,8 @@ STEPS_BECAUSE = (
 # Errors of a tenth of the noise add a hundredth to its variance.
 DTYPE_TOLERANCE = 0.1
 DTYPE_BATCHES = 10
-POOL = 8192
 # Of a normal sample: standard deviation over median deviation, and the median's standard error over the mean's.
 MEDIAN_DEVIATION, MEDIAN_ERROR = 1.4826, 1.2533
-_STEPS: WeakKeyDictionary[AccuracyRequest, LearningSteps | None] = WeakKeyDictionary()
 # The error of few scenes is noise like that of few design points; half as much adds a quarter to its variance.
 FRAMES_TOLERANCE = 0.5
 POWERS = (4, 16, 64, 256)
@@ -83,22 +77,7 @@ def steps_sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
 
 def dtype_sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
     """The sweep over arithmetic; empty where no ray meets a target."""
-    steps = run_steps(request)
-    return [] if steps is None else [dtype_sweep(steps, request.config.seed)]
-
-
-def run_steps(request: AccuracyRequest) -> LearningSteps | None:
-    """The steps of a run's learning at its learned flow, cached; None where no probe reaches a surface."""
-    if request in _STEPS:
-        return _STEPS[request]
-    target, config, steps = request.target, request.config, None
-    probes = draw_probes(target, POOL, config.seed, "steps")
-    if len(probes.points):
-        unit = config.space.to_unit(probes.points)
-        pool = Pool.of(unit, target.log_density(probes.points), probes.log_proposal)
-        learned = load_flow(request.run, FLOW, config, target, config.seed)
-        steps = LearningSteps(learned.flow, target, config.learning, pool)
-    return _STEPS.setdefault(request, steps)
+    return [] if request.steps is None else [dtype_sweep(request.steps, request.config.seed)]
 
 
 def dtype_sweep(steps: LearningSteps, seed: int) -> Sweep:
@@ -153,10 +132,9 @@ def _dtype_measure(
 
 def frames_sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
     """The sweep over numbers of frames; empty for a few scenes, or where no ray meets a target."""
-    steps = run_steps(request)
-    if steps is None or steps.target.columns <= POWERS[0]:
+    if request.steps is None or request.steps.target.columns <= POWERS[0]:
         return []
-    return [frames_sweep(steps, request.config.seed)]
+    return [frames_sweep(request.steps, request.config.seed)]
 
 
 def frames_sweep(steps: LearningSteps, seed: int) -> Sweep:

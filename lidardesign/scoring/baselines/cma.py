@@ -219,6 +219,8 @@ class CmaCandidate:
         settings: Limits of each search.
         seed: Root of the random numbers.
         bandwidth: The read-out model.
+
+    `searches` has the rays that were found, and how, by their number.
     """
 
     design: DesignSpec
@@ -230,13 +232,13 @@ class CmaCandidate:
     bandwidth: Bandwidth
     name: str = CMA
     drawn_anew: bool = False
-    _known: dict[int, tuple[RaysPerCondition, SearchRecord]] = field(default_factory=dict)
+    searches: dict[int, tuple[RaysPerCondition, SearchRecord]] = field(default_factory=dict, init=False)
 
     def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> RaysPerCondition:
         """See `lidardesign.scoring.baselines.candidates.Candidate`."""
-        if count not in self._known:
-            self._known[count] = self._searched(count)
-        return self._known[count][0]
+        if count not in self.searches:
+            self.searches[count] = self._searched(count)
+        return self.searches[count][0]
 
     def positions_within(
         self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth
@@ -244,10 +246,6 @@ class CmaCandidate:
         """See `lidardesign.scoring.baselines.candidates.Candidate`: as many rays as the design of this bandwidth."""
         of_limit = [n for n, start in self.starts.items() if mean_mbps(start, bandwidth) == limit_mbps]
         return self.positions(spaces, max(of_limit))
-
-    def record_of(self, positions: RaysPerCondition) -> SearchRecord:
-        """The search that found these rays."""
-        return next(record for known, record in self._known.values() if known is positions)
 
     @phase("cma")
     def _searched(self, count: int) -> tuple[RaysPerCondition, SearchRecord]:

@@ -12,7 +12,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, partial
-from typing import Protocol
 
 import numpy as np
 
@@ -39,26 +38,6 @@ ALIGNED = math.cos(math.pi / 4)
 TAIL = 0.005  # of the returns are left out at either end of a gate
 
 
-class SphereField(Protocol):
-    """A part of the sphere."""
-
-    def grid(self, count: int) -> np.ndarray:
-        """Exactly `count` azimuths and elevations of an even grid, shape (count, 2) [rad]."""
-
-    def spread(self, count: int, further: int) -> np.ndarray:
-        """Even points in the unit cube of further axes and in the field, shape (count, further + 2)."""
-
-    def lattice(self, spacing_rad: float) -> np.ndarray:
-        """All azimuths and elevations of a lattice with (nearly) hexagonal cells of one area, shape (K, 2) [rad]."""
-
-    def widened(self, share: float, space: DesignSpace) -> SphereField:
-        """The field widened by a share of its extents at every side, within the design space."""
-
-    @property
-    def area_sr(self) -> float:
-        """Its area, that of directions outside the design space included [sr]."""
-
-
 @dataclass(frozen=True, eq=False)
 class Zone:
     """A box of azimuths and elevations.
@@ -71,7 +50,7 @@ class Zone:
     high: np.ndarray
 
     def grid(self, count: int) -> np.ndarray:
-        """See `SphereField`."""
+        """Exactly `count` azimuths and elevations of an even grid, shape (count, 2) [rad]."""
         if not count:
             return np.zeros((0, 2))
         width, height = self.high - self.low
@@ -83,7 +62,7 @@ class Zone:
         return np.column_stack([self.low[0] + width * across, np.repeat(elevation, counts)])
 
     def spread(self, count: int, further: int) -> np.ndarray:
-        """See `SphereField`."""
+        """Even points in the unit cube of further axes and in the field, shape (count, further + 2)."""
         points = low_discrepancy(count, further + 2)
         sines = np.sin([self.low[1], self.high[1]])
         points[:, -2] = self.low[0] + (self.high - self.low)[0] * points[:, -2]
@@ -92,7 +71,10 @@ class Zone:
         return points
 
     def lattice(self, spacing_rad: float) -> np.ndarray:
-        """See `SphereField`; the spiral of the golden angle (A. Gonzalez 2010)."""
+        """All azimuths and elevations of a lattice with (nearly) hexagonal cells of one area, shape (K, 2) [rad].
+
+        It is the spiral of the golden angle (A. Gonzalez 2010).
+        """
         whole = math.ceil(2 * FULL_TURN / (SIXTH * spacing_rad**2))
         sine = 1.0 - (2 * np.arange(whole) + 1) / whole
         ends = np.sin([self.low[1], self.high[1]])
@@ -102,12 +84,12 @@ class Zone:
         return np.column_stack([azimuth, np.arcsin(sine[chosen])])[inside]
 
     def widened(self, share: float, space: DesignSpace) -> Zone:
-        """See `SphereField`."""
+        """The field widened by a share of its extents at every side, within the design space."""
         return Zone(*widened_angles(self.low, self.high, share, space))
 
     @property
     def area_sr(self) -> float:
-        """See `SphereField`."""
+        """Its area, that of directions outside the design space included [sr]."""
         return float((self.high - self.low)[0] * np.diff(np.sin([self.low[1], self.high[1]]))[0])
 
 
@@ -132,7 +114,7 @@ class Patch:
         return self.high - self.low
 
     def grid(self, count: int) -> np.ndarray:
-        """See `SphereField`; where the space cuts corners off, a finer grid without its outermost rays."""
+        """See `Zone`; where the space cuts corners off, a finer grid without its outermost rays."""
         asked = count
         while True:
             offsets = grid_tangent(*self.extents.tolist(), asked)
@@ -144,7 +126,7 @@ class Patch:
             asked = min(2 * asked, max(asked + 1, asked * count // max(len(inside), 1)))
 
     def spread(self, count: int, further: int) -> np.ndarray:
-        """See `SphereField`."""
+        """See `Zone`."""
         asked = count
         while True:
             points = low_discrepancy(asked, further + 2)
@@ -154,7 +136,7 @@ class Patch:
             asked *= 2
 
     def lattice(self, spacing_rad: float) -> np.ndarray:
-        """See `SphereField`."""
+        """See `Zone`."""
         steps = np.array([spacing_rad, SIXTH * spacing_rad])
         columns, rows = np.floor(self.extents / steps / 2).astype(np.int64) + 1
         column, row = np.meshgrid(np.arange(-columns, columns + 1), np.arange(-rows, rows + 1))
@@ -164,12 +146,12 @@ class Patch:
         return found[inside]
 
     def widened(self, share: float, space: DesignSpace) -> Patch:
-        """See `SphereField`."""
+        """See `Zone`."""
         return Patch(self.frame, self.low - share * self.extents, self.high + share * self.extents, space)
 
     @property
     def area_sr(self) -> float:
-        """See `SphereField`."""
+        """See `Zone`."""
         return float(self.extents.prod())
 
     @property
@@ -188,6 +170,9 @@ class Patch:
         points[:, AZIMUTH], points[:, ELEVATION] = angles(local @ self.frame)
         points = self.space.wrap(points)
         return points[:, AZIMUTH : ELEVATION + 1], within & self.space.contains(points)
+
+
+SphereField = Zone | Patch
 
 
 def widened_angles(

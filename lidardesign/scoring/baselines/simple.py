@@ -78,7 +78,7 @@ class Baselines:
         space: The design space.
         train: Training scenes.
         seed: Root of the baselines that are drawn.
-        judge: Scores lists of rays on training scenes, lower is better; None counts missing returns.
+        judge: Scores lists of rays on training scenes, lower is better.
         conditions: The condition values that rays are laid out at.
         gates_per_ray: Whether the rays of `bounding` may have gates of their own.
         without_visibility: Makes the layout of `no-visibility`, when that is asked for.
@@ -91,21 +91,21 @@ class Baselines:
         space: DesignSpace,
         train: Sequence[Scene],
         seed: int,
-        judge: Judge | None = None,
+        judge: Judge,
         *,
         conditions: Sequence[Mapping[str, float]] = ({},),
         gates_per_ray: bool = False,
         without_visibility: Callable[[], Candidate] | None = None,
         optimised: Callable[[], Candidate] | None = None,
-        chosen: Callable[[TrainingViews], Candidate] | None = None,
+        chosen: Callable[[TrainingViews], Candidate],
     ) -> None:
         self.space, self.train, self.seed = space, train, seed
         self.spaces = [space.at(condition) for condition in conditions]
         self.views = TrainingViews(space, train)
         self.gates_per_ray = gates_per_ray
         self.without_visibility, self.optimised, self.chosen = without_visibility, optimised, chosen
-        self._judge = judge or self.views.missing_returns
-        self._candidates: dict[str, list[Candidate]] = {}
+        self._judge = judge
+        self._candidates: dict[str, Sequence[Candidate]] = {}
         self._scores: dict[tuple[str, str, int], float] = {}
 
     def options(self, name: str, count: int) -> list[Option]:
@@ -125,15 +125,15 @@ class Baselines:
             options.append(Option(one, positions))
         return options
 
-    def candidates(self, name: str) -> list[Candidate]:
-        """The layouts that a baseline chooses from.
+    def candidates(self, name: str) -> Sequence[Candidate]:
+        """The layouts that a baseline chooses from; those of `uniform` where no training scene returns anything.
 
         Raises:
             ConfigError: There is no such baseline.
         """
         if name not in self._candidates:
             check_baseline(name)
-            self._candidates[name] = BASELINES[name](self)
+            self._candidates[name] = BASELINES[name](self) or _uniform(self)
         return self._candidates[name]
 
     @phase("baselines")
@@ -175,22 +175,8 @@ def _random(source: Baselines) -> list[Candidate]:
     return [BaselineLayout("random", place, whole_range(source.space), drawn_anew=True)]
 
 
-def _bounding(source: Baselines) -> list[Candidate]:
-    return list(bounding(source.views, gates_per_ray=source.gates_per_ray)) or _uniform(source)
-
-
-def _silhouette(source: Baselines) -> list[Candidate]:
-    return list(silhouette(source.views)) or _uniform(source)
-
-
-def _lloyd(source: Baselines) -> list[Candidate]:
-    return list(lloyd(source.views)) or _uniform(source)
-
-
 def _greedy(source: Baselines) -> list[Candidate]:
-    if source.chosen is None or not len(source.views.observed(source.space).points):
-        return _uniform(source)
-    return [source.chosen(source.views)]
+    return [source.chosen(source.views)] if len(source.views.observed(source.space).points) else []
 
 
 def _occupancy(source: Baselines) -> list[Candidate]:
@@ -219,12 +205,12 @@ def _cma(source: Baselines) -> list[Candidate]:
     return [source.optimised()]
 
 
-BASELINES: dict[str, Callable[[Baselines], list[Candidate]]] = {
+BASELINES: dict[str, Callable[[Baselines], Sequence[Candidate]]] = {
     "uniform": _uniform,
     "random": _random,
-    "bounding": _bounding,
-    "silhouette": _silhouette,
-    "lloyd": _lloyd,
+    "bounding": lambda source: bounding(source.views, gates_per_ray=source.gates_per_ray),
+    "silhouette": lambda source: silhouette(source.views),
+    "lloyd": lambda source: lloyd(source.views),
     GREEDY: _greedy,
     "occupancy": _occupancy,
     NO_VISIBILITY: _no_visibility,
@@ -261,7 +247,6 @@ class TwinCandidate:
         fired: Sequence[Fired],
     ) -> None:
         self._fit, self._conditions, self._fired = fit, conditions, fired
-        self._known: dict[tuple[int, float | None], RaysPerCondition] = {}
 
     def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> RaysPerCondition:
         """See `lidardesign.scoring.baselines.candidates.Candidate`."""
@@ -281,10 +266,8 @@ class TwinCandidate:
                 count = math.floor(FEWER_RAYS * count)
 
     def _rays(self, count: int, limit_mbps: float | None) -> RaysPerCondition:
-        if (count, limit_mbps) not in self._known:
-            design = self._fit(count, limit_mbps)
-            self._known[count, limit_mbps] = tuple(design.rays(count, at=at or None) for at in self._conditions)
-        return self._known[count, limit_mbps]
+        design = self._fit(count, limit_mbps)
+        return tuple(design.rays(count, at=at or None) for at in self._conditions)
 
 
 def occupancy(space: DesignSpace, train: Sequence[Scene], seed: int) -> BaselineLayout | None:

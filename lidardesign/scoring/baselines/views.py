@@ -84,7 +84,9 @@ class ReturnTable:
 
     @cached_property
     def _scale(self) -> tuple[float, float]:
-        return _scales(self.points)
+        """Units of directions and of origins in which each spans about 1."""
+        looking = direction(self.points[:, AZIMUTH], self.points[:, ELEVATION])
+        return tuple(float(np.ptp(part, axis=0).max()) or 1.0 for part in (looking, self.points[:, :3]))
 
     @cached_property
     def _tree(self) -> cKDTree:
@@ -129,12 +131,6 @@ class ReturnTable:
         return low, high
 
 
-def _scales(points: np.ndarray) -> tuple[float, float]:
-    """Units of directions and of origins in which each spans about 1."""
-    looking = direction(points[:, AZIMUTH], points[:, ELEVATION])
-    return tuple(float(np.ptp(part, axis=0).max()) or 1.0 for part in (looking, points[:, :3]))
-
-
 def _features(points: np.ndarray, scale: tuple[float, float]) -> np.ndarray:
     """Scaled directions and origins, whose Euclidean distance compares rays, (N, 5) to (N, 6)."""
     looking = direction(points[:, AZIMUTH], points[:, ELEVATION])
@@ -159,14 +155,17 @@ class TrainingViews:
         return [(self.train[i], SceneCaster(self.train[i], frame)) for i, frame in spread_frames(self.train)]
 
     def observed(self, space: DesignSpace) -> Observed:
-        """Returns of dense rays over a part of the design space, traced once."""
+        """Returns of dense rays over a part of the design space, even in its own measure, traced once."""
         if space not in self._observed:
-            self._observed[space] = self.hits(dense_points(space))
+            self._observed[space] = self._traced(space)
         return self._observed[space]
 
-    def hits(self, points: np.ndarray) -> Observed:
-        """Returns of rays (N, 5 or 6) on targets inside the space's range, over all views."""
-        table = self.returns(points)
+    def _traced(self, space: DesignSpace) -> Observed:
+        axes = [i for i, dimension in enumerate(space.free) if dimension != RANGE]
+        count = dense_rays(len(axes))
+        unit = np.full((count, len(space.free)), -1.0)
+        unit[:, axes] = 2 * low_discrepancy(count, len(axes)) - 1
+        table = self.returns(space.from_unit(unit))
         view, ray = np.nonzero(table.returned)
         design = np.column_stack([table.points[ray], table.range_m[view, ray]])
         hits_m = observed_point(design)
@@ -175,7 +174,7 @@ class TrainingViews:
         return Observed(design, hits_m)
 
     def returns(self, points: np.ndarray) -> ReturnTable:
-        """The same ray by ray and view by view."""
+        """Returns of rays (N, 5 or 6) on targets inside the space's range, ray by ray and view by view."""
         lowest, highest = whole_range(self.space)
         looking = direction(points[:, AZIMUTH], points[:, ELEVATION])
         range_m = np.full((len(self.casters), len(points)), np.nan)
@@ -187,19 +186,6 @@ class TrainingViews:
             range_m[view, seen] = found.range_m[seen]
             cosine[view] = np.abs(np.einsum("nk,nk->n", found.normal, looking))
         return ReturnTable(self.space, points[:, :RAY_AXES], range_m, cosine)
-
-    def missing_returns(self, lists: Sequence[RaysPerCondition]) -> list[float]:
-        """The share of rays without a return inside their gate, over all views."""
-        return [self._missing(positions) for positions in lists]
-
-    def _missing(self, positions: RaysPerCondition) -> float:
-        returned = fired = 0
-        for rays in positions:
-            for _, caster in self.casters:
-                range_m = caster.first_hit(rays.origin_m, rays.direction).range_m
-                returned += int(((range_m >= rays.gate_m[:, 0]) & (range_m < rays.gate_m[:, 1])).sum())
-                fired += len(rays)
-        return 1.0 - returned / max(fired, 1)
 
 
 def spread_frames(scenes: Sequence[Scene], most: int = MOST_VIEWS) -> list[tuple[int, int]]:
@@ -214,15 +200,6 @@ def spread_frames(scenes: Sequence[Scene], most: int = MOST_VIEWS) -> list[tuple
 def dense_rays(axes: int) -> int:
     """The number of dense rays over this many axes."""
     return DENSE_RAYS if axes > 1 else DENSE_RAYS_ON_A_LINE
-
-
-def dense_points(space: DesignSpace) -> np.ndarray:
-    """Dense rays over the space, even in its own measure, shape (M, 6)."""
-    axes = [i for i, dimension in enumerate(space.free) if dimension != RANGE]
-    count = dense_rays(len(axes))
-    unit = np.full((count, len(space.free)), -1.0)
-    unit[:, axes] = 2 * low_discrepancy(count, len(axes)) - 1
-    return space.from_unit(unit)
 
 
 def unrolled(azimuth_rad: np.ndarray) -> np.ndarray:

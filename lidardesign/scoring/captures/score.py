@@ -6,8 +6,6 @@ nearest neighbours over their whole histograms, which a single outlier does not 
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,6 +18,7 @@ from lidardesign.errors import DataError
 from lidardesign.estimates import Estimate, median_error, share_error
 from lidardesign.formats.galvo import degree_frame, middle_boresight_deg
 from lidardesign.numerics import circular_difference
+from lidardesign.run.arrays import csv_table
 from lidardesign.run.files import write_atomic
 from lidardesign.scenes.mesh_files import load_mesh
 from lidardesign.scenes.rays import Rays
@@ -302,12 +301,7 @@ def _visible_mesh(capture: Capture, path: Path) -> SurfaceCloud:
 
 def write_csv(found: CaptureEvaluation, path: Path) -> None:
     """Write the file, atomically; a cell is empty where there is no return, pixel or reference."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS)
-    for row in found.rows:
-        writer.writerows(_lines(row))
-    write_atomic(path, text.getvalue())
+    write_atomic(path, csv_table([COLUMNS, *(line for row in found.rows for line in _lines(row))]))
 
 
 def _lines(row: CaptureRow) -> list[list[object]]:

@@ -19,7 +19,6 @@ from lidardesign.rays.proposals import CANDIDATES_PER_RAY
 from lidardesign.rays.training import HELD_BACK
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
-from lidardesign.scenes.scene import Scene
 from lidardesign.scoring.baselines import cma
 from lidardesign.scoring.baselines.candidates import Candidate
 from lidardesign.scoring.baselines.greedy import GREEDY, USUAL_SCENES, Fired, GreedyCandidate, greedy_rays
@@ -124,6 +123,8 @@ def entries_of(request: EvaluationRequest) -> list[Entry]:
     starts = {one.rays: one.positions for one in searched}
     # beside several designs a baseline has as many devices as the one with the most
     devices = max((Devices.of(one.positions) for one in designs), key=lambda one: one.number, default=ONE_DEVICE)
+    fired = [Fired(entry.rays, entry.mbps(request.bandwidth)) for entry in designs]
+    refit = request.without_visibility
     baselines = Baselines(
         request.space,
         request.train,
@@ -131,9 +132,9 @@ def entries_of(request: EvaluationRequest) -> list[Entry]:
         partial(_judge, request, devices),
         conditions=conditions,
         gates_per_ray=any(design.has_gates_per_ray for design in request.designs),
-        without_visibility=partial(_twin, request, conditions, designs) if request.without_visibility else None,
+        without_visibility=refit and partial(TwinCandidate, refit, conditions, fired),
         optimised=partial(_optimised, request, conditions, starts) if request.designs else None,
-        chosen=partial(_chosen, request, conditions, designs, max(choosable, default=0)),
+        chosen=partial(_chosen, request, conditions, fired, max(choosable, default=0)),
     )
     wanted: list[tuple[str, list[Option], Entry | None]] = [
         (name, baselines.options(name, count), None)
@@ -184,7 +185,7 @@ def _entry(baselines: Baselines, name: str, option: Option, matched: Entry | Non
         redraw=partial(candidate.positions, baselines.spaces, count) if candidate.drawn_anew else None,
         matched_to=None if matched is None else matched.name,
         matched_rays=None if matched is None else matched.rays,
-        search=candidate.record_of(option.positions) if searched else None,
+        search=candidate.searches[count][1] if searched else None,
         devices=devices,
     )
 
@@ -203,7 +204,8 @@ def _of_design(
     request: EvaluationRequest, conditions: Sequence[Mapping[str, float]], design: DesignSpec, count: int
 ) -> list[Entry]:
     """The entry of a design; where its patterns follow what they see, with the best single one beside it."""
-    fixed = Entry(design.name, _laid_out(request, conditions, design, count), baseline=False)
+    positions = tuple(request.fired(design, count, condition) for condition in conditions)
+    fixed = Entry(design.name, positions, baseline=False)
     adaptive = design.following(count)
     if adaptive is None:
         return [fixed]
@@ -211,20 +213,6 @@ def _of_design(
         replace(fixed, positions=request.following(design, adaptive)),
         replace(fixed, name=f"{design.name}{SINGLE}"),
     ]
-
-
-def _laid_out(
-    request: EvaluationRequest, conditions: Sequence[Mapping[str, float]], design: DesignSpec, count: int
-) -> RaysPerCondition:
-    return tuple(request.fired(design, count, condition) for condition in conditions)
-
-
-def _twin(request: EvaluationRequest, conditions: Sequence[Mapping[str, float]], designs: Sequence[Entry]) -> Candidate:
-    return TwinCandidate(request.without_visibility, conditions, _fired(request, designs))
-
-
-def _fired(request: EvaluationRequest, designs: Sequence[Entry]) -> list[Fired]:
-    return [Fired(entry.rays, entry.mbps(request.bandwidth)) for entry in designs]
 
 
 def _optimised(
@@ -246,7 +234,7 @@ def _optimised(
 def _chosen(
     request: EvaluationRequest,
     conditions: Sequence[Mapping[str, float]],
-    designs: Sequence[Entry],
+    fired: Sequence[Fired],
     most: int,
     views: TrainingViews,
 ) -> Candidate:
@@ -258,7 +246,7 @@ def _chosen(
         scenes=max(numbers, default=USUAL_SCENES),
         gates_per_ray=any(design.has_gates_per_ray for design in request.designs),
         candidates=CANDIDATES_PER_RAY * most,
-        fired=_fired(request, designs),
+        fired=fired,
         bandwidth=request.bandwidth,
     )
 
@@ -286,7 +274,10 @@ def strongest_baseline(request: EvaluationRequest, entries: Sequence[Entry], ray
         return None
     fired = sum(entry.rays for entry in entries) * len(request.test)
     affordable = int(LARGEST_BASELINE_SHARE * fired / (rays * len(baselines)))
-    scenes = held_back_scenes(request, min(max(affordable, FEWEST_BASELINE_SCENES), MOST_BASELINE_SCENES))
+    # the first ones where a request has no others
+    held_back = request.train if request.training is None else request.training.scenes(HELD_BACK)
+    count = min(max(affordable, FEWEST_BASELINE_SCENES), MOST_BASELINE_SCENES)
+    scenes = list(itertools.islice(held_back, count))
     scene_pass = request.scene_pass(lambda number: [entry.lit_in(number) for entry in baselines], request.planner)
     found = score_scenes(replace(scene_pass, scenes=scenes))
     means = np.mean([[score.value for score, _ in scene.scores] for scene in found], axis=0).tolist()
@@ -316,16 +307,6 @@ class StrongestBaseline:
         choose = min if better == "lower" else max
         return cls(choose(values, key=lambda name: values[name]), rays, scenes, dict(values))
 
-    def as_dict(self) -> dict[str, Any]:
-        """For `--json`."""
-        return {"name": self.name, "rays": self.rays, "scenes": self.scenes, "values": dict(self.values)}
-
-
-def held_back_scenes(request: EvaluationRequest, count: int) -> list[Scene]:
-    """Training scenes that no baseline's rays were chosen on; the first ones where a request has no others."""
-    scenes = iter(request.train) if request.training is None else request.training.scenes(HELD_BACK)
-    return list(itertools.islice(scenes, count))
-
 
 def mean_baseline(found: Iterable[StrongestBaseline | None], better: str) -> StrongestBaseline | None:
     """The strongest baseline of several seeds, by its mean score over them; None where one seed has none."""
@@ -340,7 +321,23 @@ def mean_baseline(found: Iterable[StrongestBaseline | None], better: str) -> Str
 
 def effect_summaries(plans: Sequence[EffectPlan]) -> list[EffectSummary]:
     """A summary per effect, in the order of the simulation."""
-    return [_summary(name, plans) for name in EFFECTS]
+    tolerance, summaries = plans[0].tolerance, []
+    for name in EFFECTS:
+        decisions = [decision for plan in plans for decision in plan.decisions if decision.name == name]
+        worst = max(decisions, key=lambda decision: decision.bound.relative(tolerance))
+        summaries.append(
+            EffectSummary(
+                worst.name,
+                sum(decision.on for decision in decisions) / len(decisions),
+                max(decision.bound.range_m for decision in decisions),
+                max(decision.bound.lost for decision in decisions),
+                tolerance,
+                worst.bound.reason,
+                sum(decision.seconds for decision in decisions),
+                worst.missing,
+            )
+        )
+    return summaries
 
 
 @dataclass(frozen=True)
@@ -392,22 +389,6 @@ class EffectSummary:
             "seconds": self.seconds,
             "missing": self.missing,
         }
-
-
-def _summary(name: str, plans: Sequence[EffectPlan]) -> EffectSummary:
-    tolerance = plans[0].tolerance
-    decisions = [decision for plan in plans for decision in plan.decisions if decision.name == name]
-    worst = max(decisions, key=lambda decision: decision.bound.relative(tolerance))
-    return EffectSummary(
-        worst.name,
-        sum(decision.on for decision in decisions) / len(decisions),
-        max(decision.bound.range_m for decision in decisions),
-        max(decision.bound.lost for decision in decisions),
-        tolerance,
-        worst.bound.reason,
-        sum(decision.seconds for decision in decisions),
-        worst.missing,
-    )
 
 
 def effect_notes(effects: Sequence[EffectSummary], choice: Choice) -> list[str]:

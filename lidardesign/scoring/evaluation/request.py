@@ -90,11 +90,6 @@ class EvaluationRequest:
     alone: Sequence[int] = ()
     named: Sequence[str] = ()
 
-    @property
-    def held_out_seed(self) -> int:
-        """Root of the held-out scenes."""
-        return self.seed if self.scenes_seed is None else self.scenes_seed
-
     @cached_property
     def metric(self) -> Metric:
         """The meaning of scores."""
@@ -187,20 +182,15 @@ def fired_numbers(designs: Sequence[DesignSpec], counts: Iterable[int]) -> list[
     kept = [count for count in asked if not designs or count in fired]
     if asked and not kept:
         chosen = sorted({count for design in designs for count in design.counts or ()})
-        sizes = [design.size for design in designs if design.size is not None]
-        why = "all are fixed patterns"
-        hint = "a design of more parts: lidardesign catalog show NAME --rays N --out FILE"
-        if chosen:
-            why, hint = "rays were chosen at other numbers", "lidardesign fit RUN --rays N"
-        who = "no design fires"
+        who, pattern = "no design fires", "all are fixed patterns"
         if len(designs) == 1:
-            who = f"{designs[0].name} does not fire"
-            why = "its rays were chosen at other numbers" if chosen else "it is a fixed pattern"
+            who, pattern = f"{designs[0].name} does not fire", "it is a fixed pattern"
+        more = "a design of more parts: lidardesign catalog show NAME --rays N --out FILE"
         raise ConfigError(
-            f"{who} {_listed(asked, 'or')} rays: {why}",
+            f"{who} {_listed(asked, 'or')} rays: {'rays were chosen at other numbers' if chosen else pattern}",
             where="--rays",
-            allowed=_listed(chosen, "or") if chosen else f"at most {max(sizes)}",
-            hint=hint,
+            allowed=_listed(chosen, "or") if chosen else f"at most {max(design.size or 0 for design in designs)}",
+            hint="lidardesign fit RUN --rays N" if chosen else more,
         )
     return kept
 
@@ -216,9 +206,9 @@ def left_out(designs: Sequence[DesignSpec], counts: Iterable[int], alone: Sequen
             some = _listed(fired, "and")
             lines.append(f"{design.name} fires {size} rays, its fixed pattern: at {some} rays an even subset of them")
         if beyond:
-            counts = design.counts
             fires = f"{size} rays, its fixed pattern"
-            fires = fires if counts is None else f"{_listed(counts, 'or')} rays, at which they were chosen"
+            if design.counts is not None:
+                fires = f"{_listed(design.counts, 'or')} rays, at which they were chosen"
             lines.append(f"{design.name} fires {fires}: it is left out at {_listed(beyond, 'and')} rays")
     fired = {count for design in designs for count in numbers_fired(design, asked)}
     empty = [count for count in asked if designs and count not in fired]

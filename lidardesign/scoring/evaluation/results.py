@@ -7,8 +7,6 @@ under the planned ones with the same random numbers: what differs is what was sk
 
 from __future__ import annotations
 
-import csv
-import io
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -18,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lidardesign.estimates import HALF_INTERVAL, Estimate, Interval, as_documents, paired_difference
+from lidardesign.run.arrays import csv_table
 from lidardesign.run.files import write_atomic
 from lidardesign.scoring.evaluation.entries import EffectSummary
 from lidardesign.scoring.evaluation.mounting import MountError
@@ -46,9 +45,6 @@ class _WithInterval:
     def half_width(self) -> float | None:
         """Half of the interval, in the metric's unit; None without one."""
         return None if self.ci_low is None or self.ci_high is None else (self.ci_high - self.ci_low) / 2
-
-    def _drawn(self, middle: float) -> tuple[float, float]:
-        return (middle, middle) if self.ci_low is None or self.ci_high is None else (self.ci_low, self.ci_high)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +100,8 @@ class Row(_WithInterval):
     @property
     def drawn_interval(self) -> tuple[float, float]:
         """The interval for pictures, without width where there is none."""
-        return self._drawn(self.value)
+        ends = (self.ci_low, self.ci_high)
+        return (self.value, self.value) if None in ends else ends
 
     def as_dict(self) -> dict[str, Any]:
         """The contract's keys, `half_width`, `details`, and at equal bandwidth the design that it was matched to."""
@@ -139,11 +136,6 @@ class Paired(_WithInterval):
     ci_high: float | None
     rays_b: int | None = None
     percent: Interval | None = None
-
-    @property
-    def drawn_interval(self) -> tuple[float, float]:
-        """The interval for pictures, without width where there is none."""
-        return self._drawn(self.difference)
 
     def as_dict(self) -> dict[str, Any]:
         """The contract's keys, `half_width` and `percent`, with `rays_b` at equal bandwidth."""
@@ -300,7 +292,7 @@ class Evaluation:
             "seeds": list(self.seeds),
             "rows": [row.as_dict() for row in self.rows],
             "paired": [pair.as_dict() for pair in self.paired],
-            "strongest_baseline": None if self.strongest_baseline is None else self.strongest_baseline.as_dict(),
+            "strongest_baseline": self.strongest_baseline and asdict(self.strongest_baseline),
             "equal_bandwidth": [row.as_dict() for row in self.equal_bandwidth],
             "paired_equal_bandwidth": [pair.as_dict() for pair in self.paired_bandwidth],
             "detector": self.detector,
@@ -336,38 +328,38 @@ def verdict(evaluation: Evaluation, pair: Paired) -> str:
     return "better" if high < 0 else "worse" if low > 0 else "open"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class AuditRow:
     """The change of one row by skipped effects.
 
     Arguments:
-        design: Its name.
-        rays: Rays per frame.
-        planned, everything: Mean score under the planned effects, and under all.
+        planned, everything: The row under the planned effects, and under all.
         difference: Mean over scenes of planned minus all, in the metric's unit.
         ci_low, ci_high: Ends of its 95 % interval; None where all scenes are of one group.
-        seconds, seconds_everything: Time to simulate and score all scenes [s].
-        matched_to, matched_rays: As in the row at equal bandwidth.
     """
 
-    design: str
-    rays: int
-    planned: float
-    everything: float
+    planned: Row
+    everything: Row
     difference: float
     ci_low: float | None
     ci_high: float | None
-    seconds: float
-    seconds_everything: float
-    matched_to: str | None = None
-    matched_rays: int | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """All fields; the design that it was matched to only at equal bandwidth."""
-        values = {name: getattr(self, name) for name in self.__dataclass_fields__}
-        if self.matched_to is None:
-            del values["matched_to"], values["matched_rays"]
-        return values
+        """For `--json`; the design that it was matched to only at equal bandwidth."""
+        row = self.planned
+        values = {
+            "design": row.design,
+            "rays": row.rays,
+            "planned": row.value,
+            "everything": self.everything.value,
+            "difference": self.difference,
+            "ci_low": self.ci_low,
+            "ci_high": self.ci_high,
+            "seconds": row.seconds,
+            "seconds_everything": self.everything.seconds,
+        }
+        matched = {"matched_to": row.matched_to, "matched_rays": row.matched_rays}
+        return values if row.matched_to is None else values | matched
 
 
 @dataclass(frozen=True, eq=False)
@@ -401,7 +393,7 @@ class Audit:
     @property
     def seconds(self) -> tuple[float, float]:
         """Time of all rows under the plan and under all effects [s]."""
-        return sum(row.seconds for row in self.rows), sum(row.seconds_everything for row in self.rows)
+        return sum(row.planned.seconds for row in self.rows), sum(row.everything.seconds for row in self.rows)
 
     def as_dict(self) -> dict[str, Any]:
         """For `--json`."""
@@ -422,17 +414,7 @@ class Audit:
 def audit_rows(planned: Sequence[Row], everything: Sequence[Row], metric: Metric) -> list[AuditRow]:
     """The same rows under both, paired."""
     return [
-        AuditRow(
-            row.design,
-            row.rays,
-            row.value,
-            other.value,
-            *paired_difference(row.per_scene, other.per_scene, row.groups, limits=metric.limits),
-            row.seconds,
-            other.seconds,
-            row.matched_to,
-            row.matched_rays,
-        )
+        AuditRow(row, other, *paired_difference(row.per_scene, other.per_scene, row.groups, limits=metric.limits))
         for row, other in zip(planned, everything, strict=True)
     ]
 
@@ -455,28 +437,25 @@ def csv_text(evaluation: Evaluation) -> str:
         f"worst decile [{unit}]",
         f"worst sensor lost [{unit}]",
     )
-    buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(header)
-    for row in (*evaluation.rows, *evaluation.equal_bandwidth):
-        writer.writerow(
-            (
-                _no_formula(row.design),
-                row.rays,
-                row.value,
-                row.ci_low,
-                row.ci_high,
-                row.failures,
-                evaluation.scenes,
-                row.bandwidth_mbps,
-                row.seconds,
-                _no_formula(row.matched_to or ""),
-                "" if row.matched_rays is None else row.matched_rays,
-                row.worst_decile,
-                row.worst_lost,
-            )
+    rows = [
+        (
+            _no_formula(row.design),
+            row.rays,
+            row.value,
+            row.ci_low,
+            row.ci_high,
+            row.failures,
+            evaluation.scenes,
+            row.bandwidth_mbps,
+            row.seconds,
+            _no_formula(row.matched_to or ""),
+            "" if row.matched_rays is None else row.matched_rays,
+            row.worst_decile,
+            row.worst_lost,
         )
-    return buffer.getvalue()
+        for row in (*evaluation.rows, *evaluation.equal_bandwidth)
+    ]
+    return csv_table([header, *rows])
 
 
 def write_csv(evaluation: Evaluation, path: Path) -> None:

@@ -150,7 +150,9 @@ def check_audit(evaluation: Evaluation) -> None:
     """
     audit = evaluation.audit
     if audit is not None and audit.failed:
-        rows = ", ".join(f"{row.design} at {row.rays} rays by {abs(row.difference):.4g}" for row in audit.failed)
+        rows = ", ".join(
+            f"{row.planned.design} at {row.planned.rays} rays by {abs(row.difference):.4g}" for row in audit.failed
+        )
         there = {effect.name for effect in evaluation.effects if effect.range_m or effect.lost}
         raise ThresholdError(
             f"skipped effects move {rows} {audit.unit}",
