@@ -39,7 +39,7 @@ Colour = tuple[int, int, int]
 # In shares of the scene's extent.
 DENSITY_SIZE, HANDLE_SIZE, SENSOR_SIZE, POINT_SIZE, AXES_SIZE, CAMERA_AWAY = 0.003, 0.16, 0.012, 0.006, 0.1, 0.8
 LABEL_SCALE, LINE_PX = 0.8, 1.3
-FROM_AHEAD_RAD = 1.4
+FROM_AHEAD_RAD, MOUNTED_AWAY = 1.4, 1.3
 
 
 class Stage:
@@ -98,18 +98,19 @@ class Stage:
             )
             self._bodies.append((body, handle))
         if is_first:
-            self.api.add_frame(
-                "/frame", axes_length=AXES_SIZE * self.extent_m, axes_radius=0.02 * AXES_SIZE * self.extent_m
+            length = AXES_SIZE * self.extent_m
+            self.api.add_frame("/frame", axes_length=length, axes_radius=0.02 * length)
+            self.api.add_label(
+                "/frame/name", f"x of {self._frame}", position=(length, 0, 0), font_screen_scale=LABEL_SCALE
             )
-            self.api.add_label("/frame/name", f"origin of {self._frame}", font_screen_scale=LABEL_SCALE)
             directions = np.concatenate([np.zeros((0, 3)), *(one.direction for one in rays)])
             first = camera(directions)
             # a robot that carries its sensors hides them from behind
-            turn = first["turn"] - (FROM_AHEAD_RAD if self._is_mounted else 0.0)
-            away = direction(turn, first["height"])
+            turn, share = (FROM_AHEAD_RAD, MOUNTED_AWAY) if self._is_mounted else (0.0, CAMERA_AWAY)
+            away = share * self.extent_m * direction(first["turn"] - turn, first["height"])
             middle = self.bounds.mean(axis=0)
             self._server.initial_camera.look_at = middle
-            self._server.initial_camera.position = middle + CAMERA_AWAY * self.extent_m * away
+            self._server.initial_camera.position = middle + away
 
     def show_seen(self, scene: Scene, returns: Returns, beside: Colour | None = None) -> None:
         """Draw rays by what becomes of them, and their returns as points; those of a design beside it in one colour."""

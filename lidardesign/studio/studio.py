@@ -16,7 +16,7 @@ import numpy as np
 from lidardesign.api.design import Design
 from lidardesign.api.run import FIXED_BASELINES
 from lidardesign.api.training_scores import TrainingScores
-from lidardesign.errors import ConfigError, LidardesignError
+from lidardesign.errors import BackgroundNote, ConfigError, LidardesignError
 from lidardesign.estimates import Interval, figure_and_interval
 from lidardesign.fitting.options import FitOptions
 from lidardesign.formats.registry import EXPORTERS
@@ -365,6 +365,7 @@ class Studio:
         self._begin("fitting")
         remarks: list[str] = []
         design = choices.fit(NAME, progress=self._step, notes=remarks.append)
+        remarks = [remark for remark in remarks if not isinstance(remark, BackgroundNote)]
         self._page.ask("fitted", partial(self._take_fit, choices, design, remarks))
 
     def _take_fit(self, asked: Choices, design: Design, remarks: list[str]) -> None:
@@ -427,9 +428,7 @@ class Studio:
             for row in scores.rows
         )
         text = f"{scores.evaluation.scenes} **held-out** scenes, which nothing was chosen on; "
-        text += (
-            f"{metric.better} is better.\n\n| | rays | Mbit/s | {metric.name} [{metric.unit}] |\n|---|---|---|---|\n"
-        )
+        text += f"{metric.better} is better.\n\n| | rays | Mbit/s | {metric.name} [{metric.unit}] |\n"
         self._panel.working.content = ""
         self._panel.show_scores(f"{text}|---|---|---|---|\n{rows}", scores.figure("bandwidth"))
 
