@@ -197,7 +197,10 @@ class Stage:
         self, name: str, add: Callable[..., Any], points: np.ndarray, colors: np.ndarray, options: dict[str, Any]
     ) -> None:
         handle = self._nodes.get(name)
-        if handle is None:
+        if not len(points):
+            # the browser calls empty buffers an error
+            self.remove(name)
+        elif handle is None:
             self._nodes[name] = add(name, points, colors, visible=self._visible.get(name, True), **options)
         else:
             handle.points, handle.colors = points, colors

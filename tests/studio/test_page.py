@@ -26,18 +26,18 @@ def browser():
 
 
 @pytest.fixture(scope="module")
+def robot(tmp_path_factory):
+    run = open_run(make_robot_run(tmp_path_factory.mktemp("studio") / "robot"))
+    run.fit(sensors=2, rays=16, name="two").save()
+    return run
+
+
+@pytest.fixture(scope="module")
 def balls(tmp_path_factory):
     folder = make_mesh_run(tmp_path_factory.mktemp("studio") / "balls", overrides=["task.origin_box_m=[0.2, 0.2, 0.2]"])
     run = open_run(folder)
     run.fit(sensors=2, rays=16, name="two").save()
     return run
-
-
-@pytest.fixture
-def studio(balls):
-    studio = Studio(balls)
-    yield studio
-    studio.stop()
 
 
 class Tab:
@@ -80,69 +80,62 @@ class Tab:
         self.page.mouse.up()
 
 
-def test_a_sensor_that_is_dragged_takes_its_rays_along_and_is_fixed_in_every_tab(studio, browser):
-    tab, other = Tab(browser, studio), Tab(browser, studio)
-    for one in (tab, other):
-        one.open("Move")
-    before = studio.choices
-    sensor = before.sensors[0]
-    tab.page.mouse.click(*tab.pixel(sensor.origin_m))
-    wait_for(lambda: tab.field("handle on").input_value() == "s0")
-    # by the arrow that points up
-    arrow_m = HANDLE_SIZE * studio._stage.extent_m * sensor.frame[2]
-    tab.drag(tab.pixel(sensor.origin_m + 0.95 * arrow_m), tab.pixel(sensor.origin_m + 1.3 * arrow_m))
-    wait_for(lambda: studio.choices is not before)
-    after = studio.choices
-    moved = after.sensors[0].origin_m
-    assert moved[2] > sensor.origin_m[2] + 0.01
-    assert after.constraints["each"][0]["origin"]["fixed_m"] == moved.tolist()
-    assert after.constraints["sensors"] == {"count": 2}
-    own = after.design.rays(16).sensor == 0
-    assert (after.design.rays(16).origin_m[own] == moved).all()
-    kept = before.design.rays(16).direction
-    np.testing.assert_allclose(after.design.rays(16).direction, kept, rtol=0, atol=1e-12)
-    for one in (tab, other):
-        one.page.get_by_text("fixed: place").wait_for()
-        one.page.get_by_text("than before the last change").wait_for()
-        assert float(one.field("x, y, z [m]").input_value()) == pytest.approx(moved[0], abs=6e-4)
-    tab.press("Undo")
-    wait_for(lambda: studio.choices is before)
-    other.page.get_by_text("may place it elsewhere").wait_for()
-    assert not tab.errors
-    assert not other.errors
+def test_a_sensor_that_is_dragged_takes_its_rays_along_and_is_fixed_in_every_tab(balls, browser):
+    with Studio(balls) as studio:
+        tab, other = Tab(browser, studio), Tab(browser, studio)
+        for one in (tab, other):
+            one.open("Move")
+        before = studio.choices
+        sensor = before.sensors[0]
+        tab.page.mouse.click(*tab.pixel(sensor.origin_m))
+        wait_for(lambda: tab.field("handle on").input_value() == "s0")
+        # by the arrow that points up
+        arrow_m = HANDLE_SIZE * studio._stage.extent_m * sensor.frame[2]
+        tab.drag(tab.pixel(sensor.origin_m + 0.95 * arrow_m), tab.pixel(sensor.origin_m + 1.3 * arrow_m))
+        wait_for(lambda: studio.choices is not before)
+        after = studio.choices
+        moved = after.sensors[0].origin_m
+        assert moved[2] > sensor.origin_m[2] + 0.01
+        assert after.constraints["each"][0]["origin"]["fixed_m"] == moved.tolist()
+        assert after.constraints["sensors"] == {"count": 2}
+        own = after.design.rays(16).sensor == 0
+        assert (after.design.rays(16).origin_m[own] == moved).all()
+        kept = before.design.rays(16).direction
+        np.testing.assert_allclose(after.design.rays(16).direction, kept, rtol=0, atol=1e-12)
+        for one in (tab, other):
+            one.page.get_by_text("fixed: place").wait_for()
+            one.page.get_by_text("than before the last change").wait_for()
+            assert float(one.field("x, y, z [m]").input_value()) == pytest.approx(moved[0], abs=6e-4)
+        tab.press("Undo")
+        wait_for(lambda: studio.choices is before)
+        other.page.get_by_text("may place it elsewhere").wait_for()
+        assert not tab.errors
+        assert not other.errors
 
 
-def test_a_user_narrows_a_field_fits_scores_and_saves(studio, browser, balls):
-    tab = Tab(browser, studio)
-    tab.open("Limits")
-    tab.page.get_by_text("field of view", exact=True).last.click()
-    tab.field("horizontal max [deg]").fill("2")
-    tab.field("horizontal max [deg]").press("Enter")
-    wait_for(lambda: studio.choices.value("field_of_view.horizontal_deg.max") == "2")
-    tab.page.get_by_text("changed: press Fit").wait_for()
-    tab.press("Fit")
-    tab.page.get_by_text("as fitted").wait_for(timeout=60_000)
-    assert all(math.degrees(sensor.field_of_view_rad[0]) <= 2 for sensor in studio.choices.sensors)
-    tab.open("Save")
-    tab.press("Save the design and its constraints")
-    wait_for(lambda: balls.design_path("studio").exists())
-    tab.press("Mounting page")
-    tab.page.get_by_text("wrote").wait_for()
-    tab.open("Scores")
-    tab.press("Score")
-    tab.page.get_by_text("held-out scenes, which").wait_for(timeout=60_000)
-    tab.page.locator(".js-plotly-plot").wait_for()
-    assert not tab.errors
-
-
-def test_a_robot_carries_its_sensors_on_the_page(browser, tmp_path):
-    studio = Studio(open_run(make_robot_run(tmp_path / "robot")))
-    try:
+def test_a_user_narrows_a_field_of_a_robots_sensors_fits_scores_and_saves(robot, browser):
+    with Studio(robot) as studio:
         tab = Tab(browser, studio)
         tab.open("Move")
         tab.field("handle on").click()
         tab.page.get_by_role("option", name="s0", exact=True).click()
         tab.page.get_by_text("in the frame of the robot's body 'torso'").wait_for()
+        tab.open("Limits")
+        tab.page.get_by_text("field of view", exact=True).last.click()
+        tab.field("horizontal max [deg]").fill("2")
+        tab.field("horizontal max [deg]").press("Enter")
+        wait_for(lambda: studio.choices.value("field_of_view.horizontal_deg.max") == "2")
+        tab.page.get_by_text("changed: press Fit").wait_for()
+        tab.press("Fit")
+        tab.page.get_by_text("as fitted").wait_for(timeout=60_000)
+        assert all(math.degrees(sensor.field_of_view_rad[0]) <= 2 for sensor in studio.choices.sensors)
+        tab.open("Save")
+        tab.press("Save the design and its constraints")
+        wait_for(lambda: robot.design_path("studio").exists())
+        tab.press("Mounting page")
+        tab.page.get_by_text("wrote").wait_for()
+        tab.open("Scores")
+        tab.press("Score")
+        tab.page.get_by_text("held-out scenes, which").wait_for(timeout=60_000)
+        tab.page.locator(".js-plotly-plot").wait_for()
         assert not tab.errors
-    finally:
-        studio.stop()
