@@ -4,6 +4,7 @@
 # make consumers  installs the programs that tests give exported files to, from the system's packages, as CI does
 # make test-arithmetic  runs the commands of the docs with the arithmetic of a plain processor, two minutes
 # make test-pythons  installs and tests the core with every other Python that is found, four minutes each
+# make dist   builds sdist and wheel, installs the wheel with every Python that is found and runs the demo with it, ten minutes
 # make fuzz   reads 100,000 damaged files, an hour on two cores; the result goes to docs/soak; AMOUNT=N reads fewer
 # make coverage  measures the lines and branches that the tests take, an hour
 # make mutation  changes the core's code in a thousand small ways and counts what its tests notice; to docs/soak
@@ -25,7 +26,7 @@ JOBS ?= 2
 LONG := PYTHONPATH=tests $(BIN)/python -m pytest -p support.long_runs -m long -n $(JOBS) --maxschedchunk 1 \
 	--max-worker-restart 100 -o tmp_path_retention_policy=failed --page docs/soak
 
-.PHONY: demo test docs consumers setup system-programs test-arithmetic test-pythons coverage mutation lint fuzz soak soak-benchmarks soak-runs soak-seeds soak-kills soak-promise clean
+.PHONY: demo test docs dist consumers setup system-programs test-arithmetic test-pythons coverage mutation lint fuzz soak soak-benchmarks soak-runs soak-seeds soak-kills soak-promise clean
 
 $(BIN)/.ready: pyproject.toml constraints.txt
 	@echo "Setting up $(VENV): once, a minute or more"
@@ -84,6 +85,9 @@ test-arithmetic: $(BIN)/.dev
 # What every other Python that is found makes of the installation and of the core
 test-pythons: $(BIN)/.dev
 	tools/test-pythons.sh $(BIN)/python
+
+dist: $(BIN)/.dev
+	tools/dist.sh $(BIN)/python
 
 # The suite with every line and branch that it takes; what numba compiles, apart, in a run without the compiler
 KERNELS := NUMBA_DISABLE_JIT=1 $(BIN)/python -m coverage

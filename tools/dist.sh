@@ -1,0 +1,20 @@
+#!/usr/bin/env bash
+# Builds sdist and wheel into dist/, installs the wheel with every Python from 3.11 to 3.13 that is found, each in an empty
+# environment under build/, and runs the demo with it.
+set -euo pipefail
+rm -rf dist
+"$1" -m build --no-isolation --outdir dist . > /dev/null
+ls dist
+for version in 3.11 3.12 3.13; do
+    found=("${PYENV_ROOT:-$HOME/.pyenv}"/versions/"$version".*/bin/python)
+    python="${found[-1]}"
+    [ -x "$python" ] || python="$(command -v "python$version" || true)"
+    [ -n "$python" ] || { echo "Python $version is not here"; continue; }
+    place="build/dist-$version"
+    echo "Python $version: installing the wheel, running the demo"
+    rm -rf "$place"
+    "$python" -m venv "$place"
+    PYTHONWARNINGS=ignore "$place/bin/python" -m pip install --quiet --constraint constraints.txt dist/*.whl
+    # from elsewhere, so that the checkout's own package is not found
+    (cd "$place" && bin/python ../../examples/demo.py --out demo | tail -n 25)
+done
