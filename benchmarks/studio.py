@@ -103,9 +103,9 @@ def main() -> None:
             client.quiet()
         scored = []
         for number in range(5):
-            text, started = studio._panel.status.content, time.perf_counter()
+            text, started = studio._panel._status.content, time.perf_counter()
             studio._drag(drag(100 + number), True)
-            while studio._panel.status.content == text:
+            while studio._panel._status.content == text:
                 time.sleep(0.002)
             scored.append(time.perf_counter() - started)
             client.quiet()

@@ -43,9 +43,11 @@ class SensorPose:
     @classmethod
     def of(cls, place_m: Sequence[float], angles_deg: Sequence[float] = (0.0, 0.0, 0.0)) -> SensorPose:
         """The rounded pose."""
+        azimuth, elevation, roll = map(float, angles_deg)
+        turned = [math.remainder(azimuth, 360.0), elevation, math.remainder(roll, 360.0)]
         # adding zero takes the sign from a rounded -0
         place = tuple(round(float(value), PLACE_DIGITS) + 0.0 for value in place_m)
-        return cls(place, tuple(round(float(value), ANGLE_DIGITS) + 0.0 for value in angles_deg))
+        return cls(place, tuple(round(value, ANGLE_DIGITS) + 0.0 for value in turned))
 
     @classmethod
     def of_sensor(cls, sensor: Sensor) -> SensorPose:
@@ -97,7 +99,14 @@ class Choices:
         """What the design is, in a line."""
         state = "changed: press Fit" if self.state == "changed" else f"as {self.state}"
         sensors = f"{len(self.sensors)} sensor{'s' * (len(self.sensors) != 1)}"
-        return f"**{self.design.name}** ({state}): {sensors}, {self.design.usual_count(ignore)} rays"
+        return f"{self.design.name} ({state}): {sensors}, {self.design.usual_count(ignore)} rays"
+
+    @property
+    def counts(self) -> tuple[int, int]:
+        """The numbers of sensors and of rays that are asked for, else those of the design."""
+        asked = self.value(self.count_key), self.value("budget.rays")
+        own = len(self.sensors), self.design.specification.count or 1
+        return tuple(int(text) if text.isdecimal() else number for text, number in zip(asked, own, strict=True))
 
     @property
     def sensors(self) -> tuple[Sensor, ...]:
@@ -199,10 +208,10 @@ class Choices:
         return replace(self._with(document), design=self.design.remounted(number, place, frame))
 
     def fixed(self, name: str) -> list[str]:
-        """What is fixed of a sensor, in words."""
+        """What is fixed of a sensor: `origin`, `boresight`."""
         each = self.constraints.get("each") or []
         entry = each[self._number(name)] if self._number(name) < len(each) else {}
-        return [word for word, key in (("place", "origin"), ("boresight", "boresight")) if key in entry]
+        return [key for key in ("origin", "boresight") if key in entry]
 
     def freed(self, name: str) -> Choices:
         """The choices with the place and boresight of a sensor open again."""
@@ -221,10 +230,14 @@ class Choices:
         return "" if node is None else _text(node)
 
     def tight(self, scope: str = EVERY) -> set[str]:
-        """The keys whose bounds limit the design, or one sensor of it."""
+        """The keys whose bounds limit the design, or one sensor of it, without what is fixed by hand."""
         checks = () if self.design.result is None else self.design.result.constraints
-        owned = [(*split_name(check.name, [*self.poses]), check) for check in checks]
-        return {key for owner, key, check in owned if room_of(check).is_tight and scope in (EVERY, owner)}
+        owned = [(*split_name(check.name, [*self.poses]), check) for check in checks if room_of(check).is_tight]
+        return {
+            key
+            for owner, key, _ in owned
+            if scope in (EVERY, owner) and not (owner and key.split(".")[0] in self.fixed(owner))
+        }
 
     def _number(self, name: str) -> int:
         return [sensor.name for sensor in self.sensors].index(name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from html import escape
 from typing import Any
 
 import viser
@@ -23,10 +24,11 @@ LIGHTS = {
 DETECTORS = ("ideal", "single-photon", "consumer-8x8")
 LAYERS = {
     "rays": "/design/rays", "returns": "/design/returns", "fields of view and gates": "/design/fields of view",
-    "density": "/density", "places": "/places", "blind surface": "/blind",
+    "what is worth seeing (density)": "/density", "where sensors may be": "/places", "blind surface": "/blind",
 }  # fmt: skip
-HIDDEN = ("density", "blind surface")  # at first
+DENSITY, BLIND = "what is worth seeing (density)", "blind surface"  # hidden at first
 MODULE = "module-45x45-8x8"  # offered beside the parts of the catalogue; others are typed as a limit
+BOX = "overflow: auto; white-space: pre-wrap; font-size: 0.85em; line-height: 1.25em; padding: 0 1em;"
 MOST_SENSORS, MOST_RAYS, WIDTH_PX = 12, 1000, 420
 
 
@@ -57,9 +59,11 @@ class ControlPanel:
         self.gui.main_panel.dock_right()
         self.gui.main_panel.set_width(WIDTH_PX)
         self.gui.set_panel_label(f"studio: {choices.run.folder.name}")
-        self.status = self.gui.add_markdown("")
         self._input(self.gui.add_button_group("", STEPS), "step")
-        self.working = self.gui.add_markdown("")
+        # of fixed heights, so that controls stay where they are
+        self._status, self._working = self.gui.add_html(""), self.gui.add_html("")
+        self.say_status(())
+        self.say("")
         tabs = self.gui.add_tab_group()
         with tabs.add_tab("See"):
             self._see(choices, designs, baselines)
@@ -72,6 +76,17 @@ class ControlPanel:
             self.scores = self.gui.add_markdown("Score judges the design and baselines on **held-out** scenes.")
         with tabs.add_tab("Save"):
             self._save()
+
+    def say_status(self, lines: Sequence[str]) -> None:
+        """Show what the design is and what it is worth."""
+        text = "<br>".join(
+            f"<b>{escape(line)}</b>" if not number else escape(line) for number, line in enumerate(lines)
+        )
+        self._status.content = f'<div style="{BOX} height: 7.6em">{text}</div>'
+
+    def say(self, text: str) -> None:
+        """Show what is under way, or went wrong."""
+        self._working.content = f'<div style="{BOX} height: 4.6em; color: #9a3412">{escape(text)}</div>'
 
     def _input(self, control: Any, wish: str, key: str | None = None) -> Any:
         """A control whose changes by a user are wishes; those by the program are not."""
@@ -98,7 +113,7 @@ class ControlPanel:
         self.outcomes = gui.add_html("")
         with gui.add_folder("shown"):
             for name in LAYERS:
-                self._input(gui.add_checkbox(name, initial_value=name not in HIDDEN), "layer", name)
+                self._input(gui.add_checkbox(name, initial_value=name not in (DENSITY, BLIND)), "layer", name)
 
     def _move(self, choices: Choices, parts: Sequence[str]) -> None:
         gui = self.gui
@@ -139,7 +154,7 @@ class ControlPanel:
         self._input(gui.add_button("Save the design and its constraints"), "save")
         self.saved = gui.add_markdown("")
         self.command = gui.add_text("the same from a shell", initial_value="", multiline=True)
-        self.format = self._input(gui.add_dropdown("export as", [NONE, *EXPORTERS]), "export")
+        self.format = self._input(gui.add_dropdown("export as", ["choose a format", *EXPORTERS]), "export")
         self._input(gui.add_button("Mounting page"), "mounts")
 
     def show(self, choices: Choices, handle: str, scope: str, counts: tuple[int, int]) -> None:
@@ -151,13 +166,13 @@ class ControlPanel:
             scope: Whose limits are shown.
             counts: The number of scenes of the split, and of frames of the scene.
         """
-        names, rays = [sensor.name for sensor in choices.sensors], choices.design.specification.count or 1
+        names, (sensors, rays) = [sensor.name for sensor in choices.sensors], choices.counts
         _offer(self.handle, [NONE, *choices.poses], handle)
         _offer(self.scope, [EVERY, *names], scope)
         for slider, value, most in (
             (self.scene, choices.scene, counts[0] - 1),
             (self.frame, choices.frame, counts[1] - 1),
-            (self.count, len(names), max(MOST_SENSORS, len(names))),
+            (self.count, sensors, max(MOST_SENSORS, sensors)),
             (self.rays, rays, max(MOST_RAYS, rays)),
         ):
             slider.max, slider.disabled = max(most, 1), most < 1
@@ -178,7 +193,8 @@ class ControlPanel:
         if pose is None:
             self.where.content = "Choose a sensor, or click its ball in the view; in training scenes it can be moved."
             return
-        fixed = " and ".join(choices.fixed(name)) if is_sensor else "place"
+        words = {"origin": "place", "boresight": "direction"}
+        fixed = " and ".join(words[key] for key in choices.fixed(name)) if is_sensor else "place"
         kept = f"fixed: {fixed}" if fixed else "the next fit may place it elsewhere"
         self.where.content = f"**{name}** in {choices.design.specification.frame}; {kept}"
         _give(self.place, pose.place_m)

@@ -184,7 +184,9 @@ class Stage:
 
     def _lines(self, name: str, ends_m: np.ndarray, shades: np.ndarray) -> None:
         """Draw segments (N, 2, 3) [m] in colours (N, 3), or move those of this name."""
-        colours = np.repeat(shades[:, None], 2, axis=1).astype(np.uint8)
+        # lines are shaded in linear light, unlike points
+        linear = 255.0 * (shades / 255.0) ** 2.2
+        colours = np.repeat(linear.round()[:, None], 2, axis=1).astype(np.uint8)
         options = {"thickness": LINE_PX, "thickness_units": "screen"}
         self._node(name, self.api.add_line_segments, ends_m, colours, options)
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from html import escape
+from pathlib import Path
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +18,7 @@ import numpy as np
 from lidardesign.api.design import Design
 from lidardesign.api.run import FIXED_BASELINES
 from lidardesign.api.training_scores import TrainingScores
+from lidardesign.constraints.origins import SAME_PLACE_M, place_text
 from lidardesign.errors import BackgroundNote, ConfigError, LidardesignError
 from lidardesign.estimates import Interval, figure_and_interval
 from lidardesign.fitting.options import FitOptions
@@ -32,7 +35,7 @@ from lidardesign.sensors.adaptive import mean_mbps
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.space import observed_point
 from lidardesign.studio.choices import EVERY, MOUNT, Choices, SensorPose
-from lidardesign.studio.panel import LAYERS, LIGHTS, NONE, SPLITS, STEPS, ControlPanel
+from lidardesign.studio.panel import BLIND, DENSITY, LAYERS, LIGHTS, NONE, SPLITS, STEPS, ControlPanel
 from lidardesign.studio.server import start_server, stop_server
 from lidardesign.studio.stage import BESIDE, COLOURS, Stage
 from lidardesign.task import random_generator
@@ -46,11 +49,12 @@ if TYPE_CHECKING:
 
 DENSITY_POINTS = 3000
 MOST_UNDONE = 100
+ABOUT_BASELINES = "Baselines fire as many rays, each wherever it likes: no part or limit holds for them."
 NAME = "studio"  # of designs that are not saved yet
 CONSTRAINTS = "constraints"  # the folder of constraint files in a run
 END_S = 1.0  # for which what is under way is waited for
-# What sliders change, which pass many values on their way.
-SLID = (("limit", "budget.rays"), ("count", ""))
+# Controls whose changes within a time are one step back: sliders, and fields while they are typed into.
+MERGED, MERGED_S = ("limit", "pose", "count"), 2.0
 
 
 class StoppedError(Exception):
@@ -114,7 +118,8 @@ class Studio:
         self._ends_m = np.array([run.config.space.low[:3], run.config.space.high[:3]])  # of places of sensors
         self._before: list[Choices] = []
         self._after: list[Choices] = []
-        self._handle, self._scope, self._last_wish, self._blind_is_shown = NONE, EVERY, ("", ""), False
+        self._handle, self._scope, self._blind_is_shown = NONE, EVERY, False
+        self._last_wish, self._last_s, self._merges = ("", ""), 0.0, False
         self._reference, self._beside = self.choices.design, None
         self._scenes: dict[tuple[str, tuple[str, ...]], list[Scene]] = {}
         self._training: dict[tuple[str, tuple[str, ...]], TrainingScores] = {}
@@ -163,20 +168,22 @@ class Studio:
         self._page.ask(key, partial(self._do, key, value))
 
     def _do(self, key: tuple[str, str], value: Any) -> None:
+        is_soon = time.monotonic() - self._last_s < MERGED_S
+        self._merges = key[0] in MERGED and key == self._last_wish and is_soon
         changed = getattr(self, f"_on_{key[0]}")(value)
         if changed is None:
             self._show_controls()
         else:
-            self._change(changed, merges=key in SLID and key == self._last_wish)
-        self._last_wish = key
+            self._change(changed)
+        self._last_wish, self._last_s = key, time.monotonic()
 
-    def _change(self, choices: Choices, *, merges: bool = False) -> None:
+    def _change(self, choices: Choices) -> None:
         """Take over other choices; Undo goes back to those before, or before the last change where they merge."""
-        if choices.design is not self.choices.design:
-            self._reference = self.choices.design
-        if not merges:
+        if not self._merges:
             self._before = [*self._before, self.choices][-MOST_UNDONE:]
-        self.choices, self._after = choices, []
+        if choices.design is not self.choices.design:
+            self._reference = self._before[-1].design
+        self.choices, self._after, self._merges = choices, [], False
         self._refresh()
 
     # What is shown.
@@ -245,6 +252,8 @@ class Studio:
         # what moves along a condition has no place of its own
         is_carried = bool(self.run.config.space.conditioned)
         place = before.place_m if is_carried else np.clip(pose.place_m, *self._ends_m)
+        if ended and np.abs(np.subtract(place, pose.place_m)).max() > SAME_PLACE_M:
+            self._panel.say(f"kept inside the places of this run: {place_text(*self._ends_m)}")
         pose = SensorPose.of(place, pose.angles_deg)
         moved = choices if pose == before else choices.moved(self._handle, pose)
         if ended and moved is not choices:
@@ -292,10 +301,10 @@ class Studio:
     def _on_layer(self, value: Any) -> None:
         name, is_shown = value
         self._stage.set_visible(LAYERS[name], bool(is_shown))
-        if name == "blind surface":
+        if name == BLIND:
             self._blind_is_shown = bool(is_shown)
             self._answers.ask("blind", partial(self._find_blind, self.choices))
-        if name == "density":
+        if name == DENSITY:
             samples = load_samples(self.run.folder, self.run.config.space)
             points = samples.resample(DENSITY_POINTS, random_generator(self.run.config.seed, "studio"))
             self._stage.show_density(observed_point(points))
@@ -355,7 +364,7 @@ class Studio:
         """
         if self._stops.is_set():
             raise StoppedError
-        self._panel.working.content = f"{label} ..." if label else ""
+        self._panel.say(f"{label} ..." if label else "")
 
     def _begin(self, label: str) -> None:
         self._stops.clear()
@@ -370,7 +379,7 @@ class Studio:
 
     def _take_fit(self, asked: Choices, design: Design, remarks: list[str]) -> None:
         is_new = self.choices.key == asked.key
-        self._panel.working.content = "  \n".join(remarks) if is_new else "the choices have changed: press Fit again"
+        self._panel.say("\n".join(remarks) if is_new else "the choices have changed: press Fit again")
         if is_new:
             self._change(replace(self.choices, design=design, state="fitted"))
 
@@ -380,7 +389,8 @@ class Studio:
         self._page.ask("found", partial(self._take_beside, found))
 
     def _take_beside(self, design: Design) -> None:
-        self._panel.working.content, self._beside = "", design
+        self._beside = design
+        self._panel.say("")
         self._refresh()
 
     def _find_blind(self, choices: Choices) -> None:
@@ -393,18 +403,20 @@ class Studio:
         if key not in self._training:
             self._training[key] = TrainingScores(self.run, detector=choices.detector, settings=choices.settings)
         scores = self._training[key]
-        text = f"**{_figure(scores.score(choices.design), metric.unit)}** {metric.name}, {metric.better} is better, "
-        text += f"on {len(scores.scenes)} training scenes that no fit chooses on"
+        lines = [
+            f"{_figure(scores.score(choices.design), metric.unit)} {metric.name}, {metric.better} is better, "
+            f"on {len(scores.scenes)} training scenes kept for comparing"
+        ]
         for name, other in (("before the last change", self._reference), (beside and beside.name, beside)):
             if other is not None and other is not choices.design:
-                text += f"  \n{_compared(scores.difference(choices.design, other), metric)} than {name}"
-        self._page.ask("scored", partial(self._show_status, choices, text))
+                lines.append(f"{_compared(scores.difference(choices.design, other), metric)} than {name}")
+        self._page.ask("scored", partial(self._show_status, choices, lines))
 
-    def _show_status(self, choices: Choices, text: str) -> None:
+    def _show_status(self, choices: Choices, lines: list[str]) -> None:
         if choices.design is self.choices.design:
             tight = sorted(choices.tight())
-            further = f"  \ntight: {', '.join(tight)}" if tight else ""
-            self._panel.status.content = f"{choices.headline}, {self._mbps:.3g} Mbit/s  \n{text}{further}"
+            further = [f"limited by {', '.join(tight)}"] if tight else []
+            self._panel.say_status([f"{choices.headline}, {self._mbps:.3g} Mbit/s", *lines, *further])
 
     def _evaluate(self, choices: Choices) -> None:
         self._begin("scoring on held-out scenes")
@@ -427,10 +439,15 @@ class Studio:
             f"{_figure(Interval(row.value, row.ci_low, row.ci_high), '')} |"
             for row in scores.rows
         )
-        text = f"{scores.evaluation.scenes} **held-out** scenes, which nothing was chosen on; "
-        text += f"{metric.better} is better.\n\n| | rays | Mbit/s | {metric.name} [{metric.unit}] |\n"
-        self._panel.working.content = ""
-        self._panel.show_scores(f"{text}|---|---|---|---|\n{rows}", scores.figure("bandwidth"))
+        text = (
+            f"{scores.evaluation.scenes} **held-out** scenes, which nothing was chosen on; {metric.better} is better."
+        )
+        heading = f"| | rays | Mbit/s | {metric.name} [{metric.unit}] |\n|---|---|---|---|"
+        figure = scores.figure("bandwidth")
+        self._panel.show_scores(f"{text}\n\n{heading}\n{rows}\n\n{ABOUT_BASELINES}", figure)
+        row = scores.rows[0]
+        value = _figure(Interval(row.value, row.ci_low, row.ci_high), metric.unit)
+        self._panel.say(f"{row.design}: {value} on held-out scenes; the tab Scores has the baselines")
 
     # What is kept.
 
@@ -441,33 +458,40 @@ class Studio:
             raise ConfigError("there is no fit of these choices yet", where="Save", hint="press Fit first")
         if self.run.design_path(name).exists():
             raise ConfigError(f"there is a design {name!r}", where="name", allowed="another name")
-        design = Design(replace(choices.design.specification, name=name), self.run)
+        design = Design(replace(choices.design.specification, name=name), self.run, None, choices.design.result)
         design.save()
         with run_lock(folder, wait_s=WAIT_S):
             write_recorded(folder, f"{CONSTRAINTS}/{name}.yaml", dump_yaml(dict(choices.constraints)).encode())
         self.saved[name] = design
         self._panel.add_design(name)
         self._panel.saved.content = f"saved {design.path} and {folder / CONSTRAINTS / name}.yaml"
+        self._change(replace(choices, design=design, base=design, state="saved"))
 
     def _on_mounts(self, _: Any) -> None:
-        self._on_export("mounts")
+        page = self._exported("mounts") / "mounts.html"
+        self._server.send_file_download(f"{page.parent.name}.html", page.read_bytes())
 
     def _on_export(self, value: Any) -> None:
-        design = self.saved.get(str(self._panel.name.value).strip())
-        if design is None:
-            raise ConfigError("only saved designs are exported", where="Export", hint="press Save first")
         if value in EXPORTERS:
-            self._panel.saved.content = f"wrote {design.export(format=value, notes=ignore).path}"
+            self._exported(value)
+
+    def _exported(self, name: str) -> Path:
+        design = self.choices.design
+        if design.path is None:
+            raise ConfigError("only saved designs are exported", where="Export", hint="press Save first")
+        path = design.export(format=name, notes=ignore).path
+        self._panel.saved.content = f"wrote {path}"
+        return path
 
     def _failed(self, error: Exception) -> None:
         """Show what went wrong; the page goes on."""
         if isinstance(error, StoppedError):
-            self._panel.working.content = "stopped"
+            self._panel.say("stopped")
             return
         is_known = isinstance(error, LidardesignError)
         title, body = ("This cannot be done", f"{error}") if is_known else ("This is a bug", f"{error!r}")
         # a tab that is opened later shows it, too
-        self._panel.working.content = f"**{title}**\n```\n{body}\n```"
+        self._panel.say(f"{title}: {body}")
         for client in self._server.get_clients().values():
             client.add_notification(title, body, color="red")
         self._show_controls()

@@ -48,7 +48,7 @@ class Tab:
         self.page, self.errors = browser.new_page(viewport={"width": 1440, "height": 900}), []
         self.page.on("console", lambda line: self.errors.append(line.text) if line.type == "error" else None)
         self.page.goto(studio.address)
-        self.page.get_by_text("no fit chooses on").wait_for()
+        self.page.get_by_text("kept for comparing").wait_for()
         (number,) = {*studio._server.get_clients()} - known
         self.client = studio._server.get_clients()[number]
 

@@ -31,9 +31,9 @@ def studio(
 ) -> None:
     """Move sensors on a page and see what they are worth.
 
-    Click the ball of a sensor and drag its handle, or type its place and angles: what you move stays there. Fit chooses
-    all the rest again, within the limits; a score on training scenes follows every change. Score judges on held-out
-    scenes. Ctrl-C ends the page.
+    Click the ball of a sensor and drag its handle, or type its place and angles: what you move or turn stays so. Fit
+    chooses all the rest again, within the limits; a score on training scenes follows every change. Score judges on
+    held-out scenes. Ctrl-C ends the page.
     """
     with command(json=False, quiet=quiet, verbose=verbose) as output:
         with phase("libraries"):
@@ -41,6 +41,8 @@ def studio(
 
         opened = open_run(run)
         chosen = None if design is None else load_design(design, opened, output.remark)
+        if chosen is None and not opened.design_paths():
+            output.remark("the run has no design yet: one is fitted first")
         with output.progress("opening"):
             page = opened.studio(chosen, port=port)
         with page:
