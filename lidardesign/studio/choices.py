@@ -44,7 +44,7 @@ class SensorPose:
     def of(cls, place_m: Sequence[float], angles_deg: Sequence[float] = (0.0, 0.0, 0.0)) -> SensorPose:
         """The rounded pose."""
         azimuth, elevation, roll = map(float, angles_deg)
-        turned = [math.remainder(azimuth, 360.0), elevation, math.remainder(roll, 360.0)]
+        turned = [azimuth % 360.0, elevation, math.remainder(roll, 360.0)]
         # adding zero takes the sign from a rounded -0
         place = tuple(round(float(value), PLACE_DIGITS) + 0.0 for value in place_m)
         return cls(place, tuple(round(value, ANGLE_DIGITS) + 0.0 for value in turned))
@@ -236,7 +236,7 @@ class Choices:
         return {
             key
             for owner, key, _ in owned
-            if scope in (EVERY, owner) and not (owner and key.split(".")[0] in self.fixed(owner))
+            if scope in (EVERY, owner) and not (owner and key.split(".")[0] in ("space", *self.fixed(owner)))
         }
 
     def _number(self, name: str) -> int:

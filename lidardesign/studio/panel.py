@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable, Sequence
 from html import escape
 from typing import Any
@@ -28,7 +29,7 @@ LAYERS = {
 }  # fmt: skip
 DENSITY, BLIND = "what is worth seeing (density)", "blind surface"  # hidden at first
 MODULE = "module-45x45-8x8"  # offered beside the parts of the catalogue; others are typed as a limit
-BOX = "overflow: auto; white-space: pre-wrap; font-size: 0.85em; line-height: 1.25em; padding: 0 1em;"
+TYPED_S = 1.0  # without a keystroke, after which what was typed counts
 MOST_SENSORS, MOST_RAYS, WIDTH_PX = 12, 1000, 420
 
 
@@ -54,13 +55,13 @@ class ControlPanel:
     ) -> None:
         self.gui, self._wish = server.gui, wish
         self._fields: dict[str, Any] = {}
+        self._typed: dict[int, object] = {}
         self.curves: Any = None
         self.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
         self.gui.main_panel.dock_right()
         self.gui.main_panel.set_width(WIDTH_PX)
         self.gui.set_panel_label(f"studio: {choices.run.folder.name}")
         self._input(self.gui.add_button_group("", STEPS), "step")
-        # of fixed heights, so that controls stay where they are
         self._status, self._working = self.gui.add_html(""), self.gui.add_html("")
         self.say_status(())
         self.say("")
@@ -79,26 +80,45 @@ class ControlPanel:
 
     def say_status(self, lines: Sequence[str]) -> None:
         """Show what the design is and what it is worth."""
-        text = "<br>".join(
-            f"<b>{escape(line)}</b>" if not number else escape(line) for number, line in enumerate(lines)
+        self._status.content = _box(
+            "7.6em",
+            "<br>".join([f"<b>{escape(line)}</b>" for line in lines[:1]] + [escape(line) for line in lines[1:]]),
         )
-        self._status.content = f'<div style="{BOX} height: 7.6em">{text}</div>'
 
-    def say(self, text: str) -> None:
+    def say(self, text: str, *, is_wrong: bool = False) -> None:
         """Show what is under way, or went wrong."""
-        self._working.content = f'<div style="{BOX} height: 4.6em; color: #9a3412">{escape(text)}</div>'
+        self._working.content = _box("4.6em", escape(text), "#b42318" if is_wrong else "#475467")
 
-    def _input(self, control: Any, wish: str, key: str | None = None) -> Any:
-        """A control whose changes by a user are wishes; those by the program are not."""
+    def _input(self, control: Any, wish: str, key: str | None = None, *, waits: bool = False) -> Any:
+        """A control whose changes by a user are wishes; those by the program are not.
+
+        What is typed or slid waits until it is left alone: every keystroke is a change.
+        """
         is_button = isinstance(control, viser.GuiButtonHandle | viser.GuiButtonGroupHandle)
 
         @control.on_click if is_button else control.on_update
         async def _(event: Any) -> None:
-            value = getattr(event.target, "value", None)
-            if event.client is not None:
+            if event.client is None:
+                return
+            self._typed[id(control)] = turn = object()
+            await asyncio.sleep(TYPED_S if waits else 0.0)
+            if self._typed.get(id(control)) is turn:
+                del self._typed[id(control)]
+                value = getattr(event.target, "value", None)
                 self._wish(wish, value if key is None else (key, value))
 
         return control
+
+    def _give(self, control: Any, value: Any) -> None:
+        """Give a control a value, unless someone types into it."""
+        if control.value != value and id(control) not in self._typed:
+            control.value = value
+
+    def _offer(self, dropdown: Any, options: Sequence[str], value: str) -> None:
+        """Give a dropdown options, of which one is chosen."""
+        if [*dropdown.options] != [*options]:
+            dropdown.options = [*options]
+        self._give(dropdown, value if value in options else options[0])
 
     def _see(self, choices: Choices, designs: Sequence[str], baselines: Sequence[str]) -> None:
         gui, shown = self.gui, choices.design.name
@@ -118,16 +138,13 @@ class ControlPanel:
     def _move(self, choices: Choices, parts: Sequence[str]) -> None:
         gui = self.gui
         count = gui.add_slider("number of sensors", min=1, max=MOST_SENSORS, step=1, initial_value=1)
-        self.count = self._input(count, "count")
+        self.count = self._input(count, "count", waits=True)
         self.part = self._input(gui.add_dropdown("made of", [ANY, MODULE, *parts]), "part")
         self.handle = self._input(gui.add_dropdown("handle on", [NONE]), "handle")
-        self.where = gui.add_markdown("")
+        self._where = gui.add_html("")
         self.place, self.angles = (
-            self._input(gui.add_vector3(label, initial_value=(0.0, 0.0, 0.0), step=step), "pose", key)
-            for label, step, key in (
-                ("x, y, z [m]", 0.001, "place_m"),
-                ("azimuth, elevation, roll [deg]", 0.1, "angles_deg"),
-            )
+            self._input(gui.add_text(label, initial_value=""), "pose", key, waits=True)
+            for label, key in (("x, y, z [m]", "place_m"), ("azimuth, elevation, roll [deg]", "angles_deg"))
         )
         self.free = self._input(gui.add_button("Let the next fit place it again"), "free")
 
@@ -135,7 +152,7 @@ class ControlPanel:
         gui = self.gui
         gui.add_markdown("What the next **Fit** keeps to. Empty: no limit. **\\***: it limits the design.")
         rays = gui.add_slider("rays", min=1, max=MOST_RAYS, step=1, initial_value=1)
-        self.rays = self._input(rays, "limit", "budget.rays")
+        self.rays = self._input(rays, "limit", "budget.rays", waits=True)
         self.detector = self._input(gui.add_dropdown("detector", DETECTORS), "detector")
         self.light = self._input(gui.add_dropdown("light", [*LIGHTS]), "light")
         self.scope = self._input(gui.add_dropdown("limits of", [EVERY]), "scope")
@@ -146,13 +163,13 @@ class ControlPanel:
             with gui.add_folder(section.replace("_", " "), expand_by_default=False):
                 for key in keys:
                     field = gui.add_text(key_label(key), initial_value="", hint=key)
-                    self._fields[key] = self._input(field, "limit", key)
+                    self._fields[key] = self._input(field, "limit", key, waits=True)
 
     def _save(self) -> None:
         gui = self.gui
-        self.name = self._input(gui.add_text("name", initial_value="studio"), "name")
+        self.name = self._input(gui.add_text("name", initial_value="studio"), "name", waits=True)
         self._input(gui.add_button("Save the design and its constraints"), "save")
-        self.saved = gui.add_markdown("")
+        self._saved = gui.add_html(_box("4em", ""))
         self.command = gui.add_text("the same from a shell", initial_value="", multiline=True)
         self.format = self._input(gui.add_dropdown("export as", ["choose a format", *EXPORTERS]), "export")
         self._input(gui.add_button("Mounting page"), "mounts")
@@ -167,8 +184,8 @@ class ControlPanel:
             counts: The number of scenes of the split, and of frames of the scene.
         """
         names, (sensors, rays) = [sensor.name for sensor in choices.sensors], choices.counts
-        _offer(self.handle, [NONE, *choices.poses], handle)
-        _offer(self.scope, [EVERY, *names], scope)
+        self._offer(self.handle, [NONE, *choices.poses], handle)
+        self._offer(self.scope, [EVERY, *names], scope)
         for slider, value, most in (
             (self.scene, choices.scene, counts[0] - 1),
             (self.frame, choices.frame, counts[1] - 1),
@@ -176,29 +193,34 @@ class ControlPanel:
             (self.rays, rays, max(MOST_RAYS, rays)),
         ):
             slider.max, slider.disabled = max(most, 1), most < 1
-            _give(slider, value)
+            self._give(slider, value)
         part, *others = choices.constraints.get("parts", {}).get("names") or [ANY]
-        _give(self.part, part if part in self.part.options and not others else ANY)
+        self._give(self.part, part if part in self.part.options and not others else ANY)
         tight = choices.tight(scope)
         for key, field in self._fields.items():
             field.disabled = scope != EVERY and key.split(".")[0] not in SensorConstraints.model_fields
             field.label = key_label(key) + " *" * ({key, key.rpartition(".")[0]} & tight != set())
-            _give(field, "" if field.disabled else choices.value(key, scope))
-        _give(self.command, choices.command(self.name.value))
+            self._give(field, "" if field.disabled else choices.value(key, scope))
+        self._give(self.command, choices.command(self.name.value))
 
     def show_pose(self, choices: Choices, name: str, pose: SensorPose | None) -> None:
         """Show the numbers of what has the handle."""
         is_sensor = pose is not None and not name.startswith(MOUNT)
         self.place.disabled, self.angles.disabled, self.free.disabled = pose is None, not is_sensor, not is_sensor
         if pose is None:
-            self.where.content = "Choose a sensor, or click its ball in the view; in training scenes it can be moved."
+            text = "Choose a sensor, or click its ball in the view; in training scenes it can be moved."
+            self._where.content = _box("2.6em", text)
             return
         words = {"origin": "place", "boresight": "direction"}
         fixed = " and ".join(words[key] for key in choices.fixed(name)) if is_sensor else "place"
         kept = f"fixed: {fixed}" if fixed else "the next fit may place it elsewhere"
-        self.where.content = f"**{name}** in {choices.design.specification.frame}; {kept}"
-        _give(self.place, pose.place_m)
-        _give(self.angles, pose.angles_deg)
+        self._where.content = _box("2.6em", f"<b>{name}</b> in {choices.design.specification.frame}; {kept}")
+        self._give(self.place, ", ".join(map(str, pose.place_m)))
+        self._give(self.angles, ", ".join(map(str, pose.angles_deg)))
+
+    def say_saved(self, text: str) -> None:
+        """Show what was written."""
+        self._saved.content = _box("4em", escape(text))
 
     def add_design(self, name: str) -> None:
         """Offer a design that was saved."""
@@ -215,13 +237,7 @@ class ControlPanel:
             self.curves.figure = figure
 
 
-def _offer(dropdown: Any, options: Sequence[str], value: str) -> None:
-    """Give a dropdown options, of which one is chosen."""
-    if [*dropdown.options] != [*options]:
-        dropdown.options = [*options]
-    _give(dropdown, value if value in options else options[0])
-
-
-def _give(control: Any, value: Any) -> None:
-    if control.value != value:
-        control.value = value
+def _box(height: str, text: str, colour: str = "inherit") -> str:
+    """A text of fixed height, so that the controls below it stay where they are."""
+    style = "overflow: auto; white-space: pre-wrap; font-size: 0.85em; line-height: 1.25em; padding: 0 1em"
+    return f'<div style="{style}; height: {height}; color: {colour}">{text}</div>'

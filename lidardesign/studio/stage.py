@@ -60,7 +60,7 @@ class Stage:
         on_drag: Callable[[SensorPose, bool], None],
     ) -> None:
         self.api, self._pick, self._drag = server.scene, on_pick, on_drag
-        self._server, self._frame, self._is_mounted = server, design.frame, design.mount is not None
+        self._server, self._mount, self._is_mounted = server, design.mount or "the world", design.mount is not None
         self._bodies: list[tuple[Body, Any]] = []
         self._scene: Scene | None = None
         self.extent_m, self.bounds = 1.0, np.zeros((2, 3))
@@ -101,7 +101,7 @@ class Stage:
             length = AXES_SIZE * self.extent_m
             self.api.add_frame("/frame", axes_length=length, axes_radius=0.02 * length)
             self.api.add_label(
-                "/frame/name", f"x of {self._frame}", position=(length, 0, 0), font_screen_scale=LABEL_SCALE
+                "/frame/name", f"x of {self._mount}", position=(length, 0, 0), font_screen_scale=LABEL_SCALE
             )
             directions = np.concatenate([np.zeros((0, 3)), *(one.direction for one in rays)])
             first = camera(directions)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from html import escape
@@ -53,8 +53,6 @@ ABOUT_BASELINES = "Baselines fire as many rays, each wherever it likes: no part 
 NAME = "studio"  # of designs that are not saved yet
 CONSTRAINTS = "constraints"  # the folder of constraint files in a run
 END_S = 1.0  # for which what is under way is waited for
-# Controls whose changes within a time are one step back: sliders, and fields while they are typed into.
-MERGED, MERGED_S = ("limit", "pose", "count"), 2.0
 
 
 class StoppedError(Exception):
@@ -119,7 +117,6 @@ class Studio:
         self._before: list[Choices] = []
         self._after: list[Choices] = []
         self._handle, self._scope, self._blind_is_shown = NONE, EVERY, False
-        self._last_wish, self._last_s, self._merges = ("", ""), 0.0, False
         self._reference, self._beside = self.choices.design, None
         self._scenes: dict[tuple[str, tuple[str, ...]], list[Scene]] = {}
         self._training: dict[tuple[str, tuple[str, ...]], TrainingScores] = {}
@@ -168,22 +165,20 @@ class Studio:
         self._page.ask(key, partial(self._do, key, value))
 
     def _do(self, key: tuple[str, str], value: Any) -> None:
-        is_soon = time.monotonic() - self._last_s < MERGED_S
-        self._merges = key[0] in MERGED and key == self._last_wish and is_soon
+        if key[0] != "step":
+            self._panel.say("")
         changed = getattr(self, f"_on_{key[0]}")(value)
         if changed is None:
             self._show_controls()
         else:
             self._change(changed)
-        self._last_wish, self._last_s = key, time.monotonic()
 
     def _change(self, choices: Choices) -> None:
-        """Take over other choices; Undo goes back to those before, or before the last change where they merge."""
-        if not self._merges:
-            self._before = [*self._before, self.choices][-MOST_UNDONE:]
+        """Take over other choices; Undo goes back to those before."""
         if choices.design is not self.choices.design:
-            self._reference = self._before[-1].design
-        self.choices, self._after, self._merges = choices, [], False
+            self._reference = self.choices.design
+        self._before = [*self._before, self.choices][-MOST_UNDONE:]
+        self.choices, self._after = choices, []
         self._refresh()
 
     # What is shown.
@@ -253,7 +248,7 @@ class Studio:
         is_carried = bool(self.run.config.space.conditioned)
         place = before.place_m if is_carried else np.clip(pose.place_m, *self._ends_m)
         if ended and np.abs(np.subtract(place, pose.place_m)).max() > SAME_PLACE_M:
-            self._panel.say(f"kept inside the places of this run: {place_text(*self._ends_m)}")
+            self._panel.say(f"kept inside the places of this run: {place_text(*self._ends_m)}", is_wrong=True)
         pose = SensorPose.of(place, pose.angles_deg)
         moved = choices if pose == before else choices.moved(self._handle, pose)
         if ended and moved is not choices:
@@ -265,10 +260,10 @@ class Studio:
             self._panel.show_pose(choices, self._handle, pose)
 
     def _on_pose(self, value: Any) -> None:
-        which, numbers = value
+        which, text = value
         pose = self._pose()
         if pose is not None:
-            self._move(SensorPose.of(**{**vars(pose), which: numbers}), True)
+            self._move(SensorPose.of(**{**vars(pose), which: _three_numbers(str(text))}), True)
 
     def _on_free(self, _: Any) -> Choices:
         return self.choices.freed(self._handle)
@@ -455,7 +450,11 @@ class Studio:
         name, choices, folder = str(self._panel.name.value).strip(), self.choices, self.run.folder
         FitOptions(name=name)  # refuses what no design may be called
         if choices.state != "fitted":
-            raise ConfigError("there is no fit of these choices yet", where="Save", hint="press Fit first")
+            raise ConfigError(
+                "there is no fit of these choices yet",
+                where="Save",
+                hint="press Fit first: what you moved or turned stays",
+            )
         if self.run.design_path(name).exists():
             raise ConfigError(f"there is a design {name!r}", where="name", allowed="another name")
         design = Design(replace(choices.design.specification, name=name), self.run, None, choices.design.result)
@@ -464,7 +463,7 @@ class Studio:
             write_recorded(folder, f"{CONSTRAINTS}/{name}.yaml", dump_yaml(dict(choices.constraints)).encode())
         self.saved[name] = design
         self._panel.add_design(name)
-        self._panel.saved.content = f"saved {design.path} and {folder / CONSTRAINTS / name}.yaml"
+        self._panel.say_saved(f"saved {design.path} and {folder / CONSTRAINTS / name}.yaml")
         self._change(replace(choices, design=design, base=design, state="saved"))
 
     def _on_mounts(self, _: Any) -> None:
@@ -480,7 +479,7 @@ class Studio:
         if design.path is None:
             raise ConfigError("only saved designs are exported", where="Export", hint="press Save first")
         path = design.export(format=name, notes=ignore).path
-        self._panel.saved.content = f"wrote {path}"
+        self._panel.say_saved(f"wrote {path}")
         return path
 
     def _failed(self, error: Exception) -> None:
@@ -491,7 +490,7 @@ class Studio:
         is_known = isinstance(error, LidardesignError)
         title, body = ("This cannot be done", f"{error}") if is_known else ("This is a bug", f"{error!r}")
         # a tab that is opened later shows it, too
-        self._panel.say(f"{title}: {body}")
+        self._panel.say(f"{title}: {body}", is_wrong=True)
         for client in self._server.get_clients().values():
             client.add_notification(title, body, color="red")
         self._show_controls()
@@ -511,4 +510,17 @@ def _compared(difference: Interval, metric: Metric) -> str:
     if difference.mean < 0:
         ends = [None if end is None else -end for end in (difference.high, difference.low)]
         difference = Interval(-difference.mean, *ends)
-    return _figure(difference, metric.unit, word)
+    return _figure(difference, "points" if metric.unit == "%" else metric.unit, word)
+
+
+def _three_numbers(text: str) -> list[float]:
+    """The numbers of a text like `0.1, 0, -2`.
+
+    Raises:
+        ConfigError: Others than three finite numbers.
+    """
+    with suppress(ValueError):
+        numbers = [float(word) for word in text.replace(",", " ").split()]
+        if len(numbers) == 3 and np.isfinite(numbers).all():
+            return numbers
+    raise ConfigError(f"{text!r} is no pose", where="Move", allowed="three numbers, as 0.1, 0, -2")
