@@ -73,7 +73,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     ),
     "studio": (
         "lidardesign studio runs/face",
-        "lidardesign studio runs/arm runs/arm/designs/mounted.yaml --port 8080 --no-browser",
+        "lidardesign studio runs/arm --port 8080 --no-browser",
     ),
     "simulate": (
         "lidardesign simulate runs/face --scenes 20 --format mcap --out faces.mcap",

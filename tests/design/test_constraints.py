@@ -66,8 +66,8 @@ LIMITS = {
     "budget.rate_hz": ([0.001, 1e12], [0, 0.0009, 1e12 + 0.5]),
     "boresight.azimuth_deg.min": ([-36000.0, 0, 36000.0], [math.inf, math.nan, "0", -36001.0, 36001.0, 1e300]),
     "boresight.elevation_deg.min": ([-90, 0.5, 90], [-90.5, 90.5]),
-    "boresight.roll_deg.min": ([-45, 0.5, 45], [-45.5, 45.5]),
-    "boresight.roll_deg.max": ([-45, 0.5, 45], [-45.5, 45.5]),
+    "boresight.roll_deg.min": ([-180, 0.5, 180], [-180.5, 180.5]),
+    "boresight.roll_deg.max": ([-180, 0.5, 180], [-180.5, 180.5]),
     "boresight.elevation_deg.max": ([-90, 0.5, 90], [-90.5, 90.5]),
     "field_of_view.horizontal_deg.min": ([0, 0.5, 360], [-0.5, 360.5]),
     "field_of_view.vertical_deg.min": ([0, 0.5, 360], [-0.5, 360.5]),
@@ -198,3 +198,11 @@ def test_a_key_without_a_value_drops_no_constraint(values, name):
 
 def test_no_constraints_say_nothing():
     assert Constraints.from_mapping(None).as_document() == Constraints.from_mapping({}).as_document() == {}
+
+
+@pytest.mark.parametrize("roll", [{"min": 46}, {"max": -46}, {"min": 90, "max": 90}])
+def test_only_parts_are_rolled_beyond_an_eighth_of_a_turn(roll):
+    rules = {"boresight": {"roll_deg": roll}}
+    with pytest.raises(InfeasibleError, match="exchanged"):
+        check_feasible(Constraints.from_mapping(rules), FACE)
+    check_feasible(Constraints.from_mapping({**rules, "parts": {"count": 1}}), FACE, sensors=1)

@@ -113,7 +113,6 @@ CONTRADICTIONS = [
     ({"parts": ["vl53l8cx"], "sensors": 1, "layout": "even"}, "parts"),
     ({"parts": ["vl53l8cx"], "sensors": 1, "gates": "sensor"}, "parts"),
     ({"parts": ["vl53l8cx"], "sensors": 1, "weights": ["variation=0.5"]}, "parts"),
-    ({"parts": ["vl53l8cx"], "sensors": 1, "constraints": {"each": [{}]}}, "parts"),
 ]
 
 
