@@ -94,6 +94,19 @@ def constraint_slack(checks: Iterable[ConstraintCheck], sensors: Sequence[str]) 
     return rows
 
 
+def broken_notes(name: str, checks: Iterable[ConstraintCheck]) -> list[str]:
+    """A line on the first bound that a design breaks, its constraints' or its own sensors'; else an empty list.
+
+    Those of the design space are left out: other spaces may be larger.
+    """
+    broken = [check for check in checks if not check.satisfied and f".{SPACE_MARK}" not in check.name]
+    if not broken:
+        return []
+    first, more = broken[0], f" and {len(broken) - 1} more" if len(broken) > 1 else ""
+    value, bound = (", ".join(f"{number:.4g}" for number in _numbers(one)) or one for one in (first.value, first.bound))
+    return [f"{name} breaks {first.name} ({value}; allowed: {bound}){more}"]
+
+
 def split_name(name: str, sensors: Sequence[str]) -> tuple[str, str]:
     """The sensor that a check is of, empty where it is of the whole design, and the key of its bound."""
     # one sensor's name may begin with another's

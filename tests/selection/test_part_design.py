@@ -22,7 +22,6 @@ from lidardesign.fitting.part_shapes import COARSE_CELL_RAD, PartBundle, cells_o
 from lidardesign.parts.catalogue import FOLDER, find_part, load_library, part_rays
 from lidardesign.rays import information
 from lidardesign.samples import load_samples
-from lidardesign.sensors.design import certificates_of
 from lidardesign.sensors.design_file import design_document
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.detector.physics import Physics
@@ -60,7 +59,7 @@ class TestDesignsOfParts:
         assert design_document(bought(run)) == design_document(bought(run))
 
     def test_say_how_far_from_the_best_they_may_be(self, run):
-        (certificate,) = certificates_of(bought(run))
+        (certificate,) = bought(run).certificates
         assert 0 <= certificate["bound"] <= certificate["value"]
         assert 0 <= certificate["gap"] <= 1
         assert certificate["scenes"] == 4
@@ -145,7 +144,7 @@ class TestTheWorldAsItIs:
         monkeypatch.setattr(part_design.HeldBackScenes, "score", score)
         spec = open_run(run).fit(**ASKED, name="last").specification
         assert spec.sensors == tried[-1].design.sensors
-        (certificate,) = certificates_of(spec)
+        (certificate,) = spec.certificates
         assert certificate["bound"] <= certificate["value"]
 
     @pytest.mark.parametrize(

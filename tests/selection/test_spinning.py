@@ -19,7 +19,6 @@ from lidardesign.fitting.spinning import RingCandidates, chosen_rings, places_of
 from lidardesign.formats.designs import load_design
 from lidardesign.numerics import FULL_TURN
 from lidardesign.rays.coverage import LARGEST
-from lidardesign.sensors.design import certificates_of
 from lidardesign.sensors.design_file import design_document, save_design
 from lidardesign.space import DesignSpace
 
@@ -106,7 +105,7 @@ class TestDesigns:
         assert design_document(again) == design_document(spec)
         np.testing.assert_array_equal(again.rays(150).direction, rays.direction)
         assert len(again.rays(75)) == 75
-        (entry,) = certificates_of(spec)
+        (entry,) = spec.certificates
         assert 0 <= entry["bound"] <= entry["value"]
         assert (entry["rays"], entry["candidates"], entry["gates"]) == (150, 15, 1)
 
