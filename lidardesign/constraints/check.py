@@ -292,8 +292,6 @@ def _pattern(
 def _astray(pattern: Mapping[str, Any], sensors: Sequence[Mapping[str, Any]], level: float) -> list[ConstraintCheck]:
     """Failed checks of chosen rays inside their sensor's place or region, field of view and gate, at any knot."""
     owner, failed = np.asarray(pattern["sensor"]), []
-    # along a condition sensors are carried
-    still = np.array([axis != pattern.get("dimension") for axis in AXES])
     for index, sensor in enumerate(sensors):
         own, view, gate = np.flatnonzero(owner == index), sensor["field_of_view_rad"], sensor["gate_m"]
         columns = ("azimuth_rad", "elevation_rad", "gate_start_m", "gate_end_m")
@@ -314,25 +312,27 @@ def _astray(pattern: Mapping[str, Any], sensors: Sequence[Mapping[str, Any]], le
         slack = AGREEMENT * gate["end"]
         kept = ends[0] >= gate["start"] - slack and ends[1] <= gate["end"] + slack
         checks.append(ConstraintCheck(f"{name}.rays.gate_m", [gate["start"], gate["end"]], ends, kept))
-        starts = np.stack([np.asarray(pattern[f"origin_{axis}"], dtype=np.float64)[:, own] for axis in AXES], axis=-1)
-        away = (starts - np.asarray(sensor["origin_m"]["mean"])) * still
-        checks.append(_starts(name, starts, away, sensor["origin_m"], level))
+        checks.append(_starts(name, pattern, own, sensor["origin_m"], level))
         failed += [check for check in checks if not check.satisfied]
     return failed
 
 
 def _starts(
-    name: str, starts: np.ndarray, away: np.ndarray, origin: Mapping[str, Any], level: float
+    name: str, pattern: Mapping[str, Any], own: np.ndarray, origin: Mapping[str, Any], level: float
 ) -> ConstraintCheck:
     """A check that rays start at their sensor's place, or in the ellipsoid of its region that holds the level."""
-    # slow to import
-    from scipy.special import chdtri
-
+    starts = np.stack([np.asarray(pattern[f"origin_{axis}"], dtype=float)[:, own].ravel() for axis in AXES], axis=1)
+    # along a condition sensors are carried
+    away = (starts - np.asarray(origin["mean"])) * [axis != pattern.get("dimension") for axis in AXES]
     variances, axes = np.linalg.eigh(np.asarray(origin.get("covariance") or np.zeros((3, 3)), dtype=np.float64))
-    free = variances > ROUNDING * max(variances[-1], 0.0)
-    reach = np.sqrt(np.maximum(variances, 0.0) * chdtri(max(free.sum(), 1), 1 - level)) + AGREEMENT
-    far = np.square(away @ axes / reach).sum(axis=-1).ravel()
-    worst = starts.reshape(-1, 3)[far.argmax()].tolist() if len(far) else origin["mean"]
+    free, quantile = int((variances > ROUNDING * variances[-1]).sum()), 0.0
+    if free:
+        # slow to import
+        from scipy.special import chdtri
+
+        quantile = float(chdtri(free, 1 - level))
+    far = np.square(away @ axes / (np.sqrt(np.maximum(variances, 0.0) * quantile) + AGREEMENT)).sum(axis=1)
+    worst = starts[far.argmax()].tolist() if len(far) else origin["mean"]
     return ConstraintCheck(f"{name}.rays.origin_m", list(origin["mean"]), worst, bool((far <= 1).all()))
 
 

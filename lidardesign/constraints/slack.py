@@ -100,11 +100,16 @@ def broken_notes(name: str, checks: Iterable[ConstraintCheck]) -> list[str]:
     Those of the design space are left out: other spaces may be larger.
     """
     broken = [check for check in checks if not check.satisfied and f".{SPACE_MARK}" not in check.name]
-    if not broken:
-        return []
-    first, more = broken[0], f" and {len(broken) - 1} more" if len(broken) > 1 else ""
-    value, bound = (", ".join(f"{number:.4g}" for number in _numbers(one)) or one for one in (first.value, first.bound))
-    return [f"{name} breaks {first.name} ({value}; allowed: {bound}){more}"]
+    more = f" and {len(broken) - 1} more" if len(broken) > 1 else ""
+    return [
+        f"{name} breaks {one.name}: {_said(one.value)}, allowed is {_said(one.bound)}{more}; lidardesign show {name} "
+        "lists all"
+        for one in broken[:1]
+    ]
+
+
+def _said(value: Any) -> Any:
+    return ", ".join(f"{one:.4g}" for one in _numbers(value)) or value
 
 
 def split_name(name: str, sensors: Sequence[str]) -> tuple[str, str]:

@@ -34,7 +34,7 @@ from lidardesign.run.xml import read_xml
 from lidardesign.run.yaml import KeyPath, load_yaml
 from lidardesign.run_folder import DESIGN_FOLDER, MANIFEST, Notes, RunFolder, log_note
 from lidardesign.sensors.design import DesignSpec
-from lidardesign.sensors.design_file import design_from_document, is_certificate_of
+from lidardesign.sensors.design_file import design_from_document, digested
 from lidardesign.space import RANGE
 
 CSV, NPZ, XML = "CSV", "NPZ", "XML"
@@ -200,7 +200,7 @@ def read_design(path: Path, notes: Notes = log_note, reach_m: float | None = Non
         raise type(error)(error.message, where=error.where, allowed=error.allowed, hint=hint) from None
     if difference is not None:
         notes(f"{path} {difference}")
-    kept = tuple(one for one in design.certificates if is_certificate_of(one, design))
+    kept = tuple(one for one in design.certificates if digested(one, design) == one)
     if len(kept) < len(design.certificates):
         of = ", ".join(f"{one.get('rays')!r:.20}" for one in design.certificates if one not in kept)
         notes(f"{path}: the certificate for {of} rays is of other rays or was changed: left out; fit again for another")

@@ -209,8 +209,8 @@ class DesignSpec:
             patterns = tuple(pattern.moved(moves) for pattern in self.patterns)
         else:
             patterns = tuple(Pattern.of(pattern.at(at.get(self.condition))) for pattern in self.patterns)
-        certificates = self.certificates if here == self.at or self.condition is not None else ()
-        return replace(self, sensors=sensors, patterns=patterns, at=here, certificates=certificates)
+        kept = self.certificates if here == self.at or self.condition is not None else ()
+        return replace(self, sensors=sensors, patterns=patterns, at=here, certificates=kept)
 
     def _moves(self, at: Mapping[str, float]) -> dict[int, float]:
         """The new coordinates of origins by axis; conditions other than origins cannot change."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -27,7 +26,6 @@ from lidardesign.sensors.sensor import DEFAULT_LEVEL, LEVELS, Sensor
 from lidardesign.space import DIMENSIONS, FARTHEST_M, FULL_TURN, LARGEST_ANGLE_RAD
 
 SCHEMA_VERSION = 2
-DIGEST, DIGITS = "digest", 16  # of certificates
 # Seven numbers of a ray at each knot stay below the number of values that the YAML reader accepts in one file.
 MOST_FILE_RAYS = 60_000
 # Weights that sum to 1 within this are taken as they stand, so that loading changes no bit.
@@ -288,21 +286,15 @@ def pattern_document(pattern: Pattern) -> dict[str, Any]:
     }
 
 
-def certified(design: DesignSpec) -> DesignSpec:
-    """The design with a digest in each certificate: of its own figures, and of the rays, gates and owners it is for."""
-    return replace(design, certificates=tuple({**one, DIGEST: _digest(one, design)} for one in design.certificates))
+def digested(certificate: Mapping[str, Any], design: DesignSpec) -> dict[str, Any]:
+    """A certificate with the digest of its own figures and of the rays, gates and owners that it is for.
 
-
-def is_certificate_of(certificate: Mapping[str, Any], design: DesignSpec) -> bool:
-    """Whether neither a certificate nor the rays of the design that it is for were changed since it was made."""
-    return certificate.get(DIGEST) == _digest(certificate, design)
-
-
-def _digest(certificate: Mapping[str, Any], design: DesignSpec) -> str:
-    figures = sorted((key, value) for key, value in certificate.items() if key != DIGEST)
+    One that has another digest, or none, was changed or is for other rays.
+    """
     pattern = design.pattern(certificate.get("rays", 0))
-    written = repr((figures, None if pattern is None else pattern_document(pattern)))
-    return hashlib.sha256(written.encode(errors="replace")).hexdigest()[:DIGITS]
+    written = {**certificate, "digest": None if pattern is None else pattern_document(pattern)}
+    text = repr(sorted(written.items())).encode(errors="replace")
+    return {**certificate, "digest": hashlib.sha256(text).hexdigest()[:16]}
 
 
 def save_design(design: DesignSpec, path: Path) -> None:

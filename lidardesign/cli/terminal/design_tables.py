@@ -214,9 +214,8 @@ def _show_choice(design: DesignSpec, rich: RichConsole) -> None:
     """Print the numbers of candidates and scenes of a choice, its loss and the lower bound of the loss."""
     from lidardesign.sensors.design import MOST_GAP
 
-    entries = design.certificates
-    if entries:
-        last, are_parts = entries[-1], all(sensor.part is not None for sensor in design.sensors)
+    if design.certificates:
+        last, are_parts = design.certificates[-1], all(sensor.part is not None for sensor in design.sensors)
         what, count = ("poses of parts", len(design.sensors)) if are_parts else ("rays", last["rays"])
         text = f"chosen among {last['candidates']} {what} on {last['scenes']} training scenes"
         if last["gap"] <= MOST_GAP:

@@ -274,8 +274,7 @@ def _notes(request: EvaluationRequest, entries: Sequence[Entry], matched: Sequen
         notes += notes_of(request.task, request.config, request.space)
     for design in request.designs:
         notes += outside_notes(design, request.space) + light_notes(design, request.planner.detector)
-        checks = check_design(design_document(design), design.constraints, request.space)
-        notes += [f"{line}; lidardesign show {design.name} lists all" for line in broken_notes(design.name, checks)]
+        notes += broken_notes(design.name, check_design(design_document(design), design.constraints, request.space))
     own = sorted((entry for entry in entries if not entry.baseline), key=lambda entry: entry.rays)
     shared = [entry for entry in own if entry.rays not in request.alone]
     # of each design the most rays, which come last
