@@ -395,18 +395,17 @@ def _pattern_widths(pattern: Mapping[str, Any], bin_m: float) -> np.ndarray:
 def _parts(document: Mapping[str, Any], parts: Mapping[str, Any] | None) -> list[ConstraintCheck]:
     """Checks that every sensor is an admitted part as its file describes it, within the numbers and power allowed.
 
-    Without constraints on parts those sensors are checked that name one.
+    Without constraints on parts, failed checks of the sensors that name one.
     """
     is_free, parts = parts is None, parts or {}
     named = [] if parts.get("names", "catalog") == "catalog" else list(parts["names"])
     checks, found = [], []
     for index, sensor in enumerate(document["sensors"]):
         name, own = f"{sensor.get('name', index)}.part", sensor.get("part")
-        if is_free and own is None:
-            continue
         part = None if own is None else _admitted_part(str(own), named)
         if part is None:
-            checks.append(ConstraintCheck(name, named or "the catalogue", own or "a sensor of its own", False))
+            value, kept = own or "a sensor of its own", is_free and own is None
+            checks.append(ConstraintCheck(name, named or "the catalogue", value, kept))
             continue
         found.append(part)
         wrong = _differences(part, index, sensor, next(iter(document.get("patterns") or ()), None))
@@ -418,7 +417,7 @@ def _parts(document: Mapping[str, Any], parts: Mapping[str, Any] | None) -> list
         if rule.get("max") is not None:
             total = sum(math.inf if part.value(name) is None else part.value(name) for part in found)
             checks += _between(f"parts.{name}", total, rule)
-    return checks
+    return [check for check in checks if not (is_free and check.satisfied)]
 
 
 def _admitted_part(name: str, named: Sequence[str]) -> Part | None:

@@ -102,8 +102,8 @@ def broken_notes(name: str, checks: Iterable[ConstraintCheck]) -> list[str]:
     broken = [check for check in checks if not check.satisfied and f".{SPACE_MARK}" not in check.name]
     more = f" and {len(broken) - 1} more" if len(broken) > 1 else ""
     return [
-        f"{name} breaks {one.name}: {_said(one.value)}, allowed is {_said(one.bound)}{more}; lidardesign show {name} "
-        "lists all"
+        f"{name} breaks {one.name}{more}: it has {_said(one.value)}, allowed is {_said(one.bound)}; "
+        f"lidardesign show {name} lists all"
         for one in broken[:1]
     ]
 
