@@ -16,7 +16,7 @@ from lidardesign.constraints.check import check_design
 from lidardesign.constraints.document import Constraints
 from lidardesign.density.objective.proposals import samples_without_visibility
 from lidardesign.errors import ConfigError
-from lidardesign.formats.designs import load_design
+from lidardesign.formats.designs import load_design, read_design
 from lidardesign.rays import training
 from lidardesign.run.yaml import dump_yaml
 from lidardesign.run_folder import RunFolder
@@ -179,6 +179,8 @@ def test_along_an_aisle_patterns_lead_all_the_way_and_keep_the_bandwidth_between
     design = chosen(aisle, constraints=rules).specification
     assert design.counts == sorted(open_run(aisle).task.defaults.rays)
     assert {pattern.ends for pattern in design.patterns} == {(space.low[0], space.high[0])}
+    save_design(design, aisle / "along.yaml")
+    assert read_design(aisle / "along.yaml").certificates == design.certificates != ()
     checks = check_design(design_document(design), Constraints.from_mapping(rules), space)
     assert all(check.satisfied for check in checks)
     for count in design.counts:
