@@ -34,7 +34,7 @@ from lidardesign.run_folder import Notes, RunFolder, ignore, log_note, settings_
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Scene
 from lidardesign.sensors.compare import outside_space
-from lidardesign.sensors.design import DesignSpec, certificates_of
+from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import design_text, save_design
 from lidardesign.task import scoring_settings
 from lidardesign.workers import check_workers, opened_workers
@@ -339,7 +339,7 @@ class Design(DesignSource):
     def as_dict(self) -> dict[str, Any]:
         """The document of `lidardesign fit --json`: sensors, and what the fit found."""
         place = self.name if self.path is None else str(self.path)
-        certificates = certificates_of(self.specification)
+        certificates = [*self.specification.certificates]
         further: dict[str, Any] = {"certificates": certificates} if certificates else {}
         if (adaptive := self.specification.adaptive) is not None:
             further["adaptive"] = {"looks": adaptive.rule.looks, "shares": adaptive.shares.tolist()}

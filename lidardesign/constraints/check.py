@@ -71,7 +71,8 @@ def check_design(document: Mapping[str, Any], constraints: Any, space: Any = Non
     """
     rules = constraints.as_document() if hasattr(constraints, "as_document") else dict(constraints or {})
     bounds = space.as_dict() if hasattr(space, "as_dict") else space
-    z = NormalDist().inv_cdf((1 + float(document.get("level", 0.95))) / 2)
+    level = float(document.get("level", 0.95))
+    z = NormalDist().inv_cdf((1 + level) / 2)
     patterns = _patterns(document)
     sensors, each = list(document["sensors"]), list(rules.get("each") or [])
     own_rules = [_over(rules, each[index]) if index < len(each) else rules for index in range(len(sensors))]
@@ -88,7 +89,7 @@ def check_design(document: Mapping[str, Any], constraints: Any, space: Any = Non
     for pattern in patterns:
         checks += _pattern(pattern, own_rules, bounds)
         if document.get("layout") == "chosen":
-            checks += _astray(pattern, sensors)
+            checks += _astray(pattern, sensors, level)
     checks += _mounts(sensors, own_rules) + _parts(document, rules.get("parts"))
     return checks + _budget(document, rules.get("budget") or {})
 
@@ -288,8 +289,8 @@ def _pattern(
     return [*failed, _within_space("pattern", pattern["dimension"], space, knots[0], knots[-1])]
 
 
-def _astray(pattern: Mapping[str, Any], sensors: Sequence[Mapping[str, Any]]) -> list[ConstraintCheck]:
-    """Failed checks of chosen rays inside their sensor's field of view and gate, at any knot."""
+def _astray(pattern: Mapping[str, Any], sensors: Sequence[Mapping[str, Any]], level: float) -> list[ConstraintCheck]:
+    """Failed checks of chosen rays inside their sensor's place or region, field of view and gate, at any knot."""
     owner, failed = np.asarray(pattern["sensor"]), []
     for index, sensor in enumerate(sensors):
         own, view, gate = np.flatnonzero(owner == index), sensor["field_of_view_rad"], sensor["gate_m"]
@@ -311,8 +312,28 @@ def _astray(pattern: Mapping[str, Any], sensors: Sequence[Mapping[str, Any]]) ->
         slack = AGREEMENT * gate["end"]
         kept = ends[0] >= gate["start"] - slack and ends[1] <= gate["end"] + slack
         checks.append(ConstraintCheck(f"{name}.rays.gate_m", [gate["start"], gate["end"]], ends, kept))
+        checks.append(_starts(name, pattern, own, sensor["origin_m"], level))
         failed += [check for check in checks if not check.satisfied]
     return failed
+
+
+def _starts(
+    name: str, pattern: Mapping[str, Any], own: np.ndarray, origin: Mapping[str, Any], level: float
+) -> ConstraintCheck:
+    """A check that rays start at their sensor's place, or in the ellipsoid of its region that holds the level."""
+    starts = np.stack([np.asarray(pattern[f"origin_{axis}"], dtype=float)[:, own].ravel() for axis in AXES], axis=1)
+    # along a condition sensors are carried
+    away = (starts - np.asarray(origin["mean"])) * [axis != pattern.get("dimension") for axis in AXES]
+    variances, axes = np.linalg.eigh(np.asarray(origin.get("covariance") or np.zeros((3, 3)), dtype=np.float64))
+    free, quantile = int((variances > ROUNDING * variances[-1]).sum()), 0.0
+    if free:
+        # slow to import
+        from scipy.special import chdtri
+
+        quantile = float(chdtri(free, 1 - level))
+    far = np.square(away @ axes / (np.sqrt(np.maximum(variances, 0.0) * quantile) + AGREEMENT)).sum(axis=1)
+    worst = starts[far.argmax()].tolist() if len(far) else origin["mean"]
+    return ConstraintCheck(f"{name}.rays.origin_m", list(origin["mean"]), worst, bool((far <= 1).all()))
 
 
 def _budget(document: Mapping[str, Any], budget: Mapping[str, Any]) -> list[ConstraintCheck]:
@@ -372,27 +393,31 @@ def _pattern_widths(pattern: Mapping[str, Any], bin_m: float) -> np.ndarray:
 
 
 def _parts(document: Mapping[str, Any], parts: Mapping[str, Any] | None) -> list[ConstraintCheck]:
-    """Checks that every sensor is an admitted part as its file describes it, within the numbers and power allowed."""
-    if parts is None:
-        return []
+    """Checks that every sensor is an admitted part as its file describes it, within the numbers and power allowed.
+
+    Without constraints on parts, failed checks of the sensors that name one.
+    """
+    is_free, parts = parts is None, parts or {}
     named = [] if parts.get("names", "catalog") == "catalog" else list(parts["names"])
     checks, found = [], []
     for index, sensor in enumerate(document["sensors"]):
         name, own = f"{sensor.get('name', index)}.part", sensor.get("part")
         part = None if own is None else _admitted_part(str(own), named)
         if part is None:
-            checks.append(ConstraintCheck(name, named or "the catalogue", own or "a sensor of its own", False))
+            value, kept = own or "a sensor of its own", is_free and own is None
+            checks.append(ConstraintCheck(name, named or "the catalogue", value, kept))
             continue
         found.append(part)
         wrong = _differences(part, index, sensor, next(iter(document.get("patterns") or ()), None))
         checks.append(ConstraintCheck(name, part.name, wrong or part.name, wrong is None))
     for own, rule in (parts.get("each") or {}).items():
-        checks += _between(f"parts.each.{own}", sum(part.name == own for part in found), rule)
+        # a bare name counts all its modes
+        checks += _between(f"parts.each.{own}", sum(f"{part.name}:".startswith(f"{own}:") for part in found), rule)
     for name, rule in (("power_w", {"max": parts.get("power_w")}), ("price", parts.get("price") or {})):
         if rule.get("max") is not None:
             total = sum(math.inf if part.value(name) is None else part.value(name) for part in found)
             checks += _between(f"parts.{name}", total, rule)
-    return checks
+    return [check for check in checks if not (is_free and check.satisfied)]
 
 
 def _admitted_part(name: str, named: Sequence[str]) -> Part | None:

@@ -203,7 +203,7 @@ class Parts(_Keys):
     Arguments:
         names: Names, `NAME:MODE`, or paths of part files and folders; `catalog` is all that are shipped.
         count: Number of parts; `--sensors` takes precedence.
-        each: The largest number of a part, by its name.
+        each: The largest number of a part, by its name; without a mode in all its modes.
         power_w: Largest power of all parts [W]; parts without a stated power are left out.
         price: Largest price of all parts, as `{max: 40}`; parts without a price are left out.
     """

@@ -94,6 +94,24 @@ def constraint_slack(checks: Iterable[ConstraintCheck], sensors: Sequence[str]) 
     return rows
 
 
+def broken_notes(name: str, checks: Iterable[ConstraintCheck]) -> list[str]:
+    """A line on the first bound that a design breaks, its constraints' or its own sensors'; else an empty list.
+
+    Those of the design space are left out: other spaces may be larger.
+    """
+    broken = [check for check in checks if not check.satisfied and f".{SPACE_MARK}" not in check.name]
+    more = f" and {len(broken) - 1} more" if len(broken) > 1 else ""
+    return [
+        f"{name} breaks {one.name}{more}: it has {_said(one.value)}, allowed is {_said(one.bound)}; "
+        f"lidardesign show {name} lists all"
+        for one in broken[:1]
+    ]
+
+
+def _said(value: Any) -> Any:
+    return ", ".join(f"{one:.4g}" for one in _numbers(value)) or value
+
+
 def split_name(name: str, sensors: Sequence[str]) -> tuple[str, str]:
     """The sensor that a check is of, empty where it is of the whole design, and the key of its bound."""
     # one sensor's name may begin with another's

@@ -42,7 +42,7 @@ from lidardesign.run.yaml import dump_yaml, parse_yaml
 from lidardesign.run_folder import Notes, RunFolder, ignore, log_note
 from lidardesign.samples import Samples, load_samples
 from lidardesign.sensors.design import DesignSpec
-from lidardesign.sensors.design_file import design_document
+from lidardesign.sensors.design_file import design_document, digested
 from lidardesign.space import DIMENSIONS
 from lidardesign.task import mount_of, random_generator
 from lidardesign.workers import Starmap
@@ -112,7 +112,12 @@ def fit_design(
     world = {WORLD: request.world} if request.world else {}
     with plugin_guard(run.task.name):
         mount = mount_of(run.task, run.config.task)
-    design = replace(design, mount=mount, provenance={**design.provenance, **origin, **weighting, **world})
+    design = replace(
+        design,
+        mount=mount,
+        certificates=tuple(digested(one, design) for one in design.certificates),
+        provenance={**design.provenance, **origin, **weighting, **world},
+    )
     with phase("writing"):
         return replace(result, design=design, constraints=check_written(design, request))
 

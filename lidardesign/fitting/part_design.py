@@ -387,6 +387,12 @@ def _limits(
             np.array([wanted.each[name].max if name in wanted.each else count for name in names]),
         )
     ]
+    # a bare name bounds all its modes together
+    kinds += [
+        (np.array([one.part.name.split(":")[0] == name for one in placed]).astype(int), np.array([count, own.max]))
+        for name, own in wanted.each.items()
+        if any(mode.startswith(f"{name}:") for mode in names)
+    ]
     mounts = {tuple(place) for rules in constraints.rules for place in rules.origin.mounts_m or ()}
     if mounts:
         place = np.array([one.place for one in placed])

@@ -34,7 +34,7 @@ from lidardesign.run.xml import read_xml
 from lidardesign.run.yaml import KeyPath, load_yaml
 from lidardesign.run_folder import DESIGN_FOLDER, MANIFEST, Notes, RunFolder, log_note
 from lidardesign.sensors.design import DesignSpec
-from lidardesign.sensors.design_file import design_from_document
+from lidardesign.sensors.design_file import design_from_document, digested
 from lidardesign.space import RANGE
 
 CSV, NPZ, XML = "CSV", "NPZ", "XML"
@@ -179,8 +179,8 @@ def _wrong_separator(separator: str, where: str) -> DataError:
 def read_design(path: Path, notes: Notes = log_note, reach_m: float | None = None) -> DesignSpec:
     """Read a design file or a rig of another program, with notes.
 
-    Notes say if a run's design differs from the one that was written, truncated or edited by hand, and which values
-    the file of a rig is missing.
+    Notes say if a run's design differs from the one that was written, truncated or edited by hand, which certificates
+    are of other rays and so left out, and which values the file of a rig is missing.
 
     Arguments:
         path: The file.
@@ -200,11 +200,15 @@ def read_design(path: Path, notes: Notes = log_note, reach_m: float | None = Non
         raise type(error)(error.message, where=error.where, allowed=error.allowed, hint=hint) from None
     if difference is not None:
         notes(f"{path} {difference}")
+    kept = tuple(one for one in design.certificates if digested(one, design) == one)
+    if len(kept) < len(design.certificates):
+        of = ", ".join(f"{one.get('rays')!r:.20}" for one in design.certificates if one not in kept)
+        notes(f"{path}: the certificate for {of} rays is of other rays or was changed: left out; fit again for another")
     # only what was read from others has notes
     further = design.provenance.get("notes") if "source" in design.provenance else None
     for note in further if isinstance(further, list) else ():
         notes(f"{path}: {note}")
-    return design
+    return replace(design, certificates=kept)
 
 
 def _difference(path: Path) -> str | None:

@@ -126,13 +126,13 @@ def named_parts(names: Sequence[str] | str, bounded: Iterable[str] = ()) -> list
 
     Arguments:
         names: See above.
-        bounded: Names of parts whose number is bounded.
+        bounded: Names of parts whose number is bounded, without a mode in all their modes.
 
     Raises:
         ConfigError: A name or path that is no part, or a bound on what is not one of the parts.
     """
     parts = _named(names)
-    known = [part.name for part in parts]
+    known = [*dict.fromkeys(name for part in parts for name in (part.name, part.name.split(":")[0]))]
     for name in bounded:
         if name not in known:
             raise ConfigError(

@@ -17,7 +17,7 @@ from lidardesign.report.figures import AXIS, LAYOUT, Series
 from lidardesign.report.markup import figure, folded, paragraphs, swatch
 from lidardesign.report.tables import four_digits, table
 from lidardesign.scoring.evaluation.results import Evaluation
-from lidardesign.sensors.design import DesignSpec, certificates_of
+from lidardesign.sensors.design import DesignSpec
 
 FEWEST_POINTS = 4  # of a rank correlation that says anything
 FIGURE_PX = 320
@@ -32,7 +32,7 @@ Points = Sequence[tuple[float, float]]
 
 def choice_section(designs: Sequence[DesignSpec], evaluation: Evaluation, looks: Mapping[str, Series]) -> str:
     """The section of certificates of all designs with chosen rays, with both figures; empty where there is none."""
-    chosen = {design.name: found for design in designs if (found := certificates_of(design))}
+    chosen = {design.name: found for design in designs if (found := design.certificates)}
     if not chosen:
         return ""
     unit = ", ".join(sorted({str(entry.get("unit", "1")) for entries in chosen.values() for entry in entries}))

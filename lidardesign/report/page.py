@@ -58,7 +58,7 @@ from lidardesign.scoring.evaluation.request import EvaluationRequest
 from lidardesign.scoring.evaluation.results import Evaluation, Paired, Row, verdict
 from lidardesign.scoring.evaluation.thresholds import headline_texts
 from lidardesign.scoring.sweep import Sweep
-from lidardesign.sensors.design import MOST_GAP, DesignSpec, certificates_of
+from lidardesign.sensors.design import MOST_GAP, DesignSpec
 from lidardesign.space import observed_point
 from lidardesign.task import random_generator
 
@@ -265,7 +265,7 @@ def _certificates(evaluation: Evaluation, designs: Sequence[DesignSpec]) -> list
     gaps = [
         f"{100 * entry['gap']:.1f} % ({design.name})"
         for design in designs
-        for entry in certificates_of(design)
+        for entry in design.certificates
         if design.name in rows and entry["rays"] == rows[design.name].rays and entry["gap"] <= MOST_GAP
     ]
     if not gaps:

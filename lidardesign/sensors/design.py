@@ -198,18 +198,19 @@ class DesignSpec:
         """The design at one value of its conditions, with patterns of one knot.
 
         Patterns along a condition are evaluated there. Other designs are moved: the named coordinate of every origin
-        becomes the value; directions and gates stay.
+        becomes the value; directions and gates stay, and certificates, which are of other rays then, are left out.
 
         Raises:
             ConfigError: A name that is no coordinate, a value beyond the ends of a pattern, or none where rays differ.
         """
-        moves = self._moves(at)
+        moves, here = self._moves(at), {**self.at, **at}
         sensors = tuple(replace(sensor, origin_m=with_coordinates(sensor.origin_m, moves)) for sensor in self.sensors)
         if self.condition is None:
             patterns = tuple(pattern.moved(moves) for pattern in self.patterns)
         else:
             patterns = tuple(Pattern.of(pattern.at(at.get(self.condition))) for pattern in self.patterns)
-        return replace(self, sensors=sensors, patterns=patterns, at={**self.at, **at})
+        kept = self.certificates if here == self.at or self.condition is not None else ()
+        return replace(self, sensors=sensors, patterns=patterns, at=here, certificates=kept)
 
     def _moves(self, at: Mapping[str, float]) -> dict[int, float]:
         """The new coordinates of origins by axis; conditions other than origins cannot change."""
@@ -231,13 +232,5 @@ class DesignSpec:
         return {DIMENSIONS.index(name): float(value) for name, value in at.items() if name in TRAVELLED}
 
 
-CERTIFIED = ("rays", "value", "bound", "gap", "held_back_value", "candidates", "gates", "scenes")
-
-
 # A bound that leaves more of the loss open than this certifies nothing that anyone would act on.
 MOST_GAP = 0.5
-
-
-def certificates_of(design: DesignSpec) -> list[dict[str, Any]]:
-    """The certificates of a design's choices of rays, one per number of rays, without damaged entries."""
-    return [entry for entry in design.certificates if all(type(entry.get(name)) in (int, float) for name in CERTIFIED)]

@@ -5,6 +5,7 @@ Numbers are written with all their digits: what is loaded is bit for bit what wa
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -283,6 +284,17 @@ def pattern_document(pattern: Pattern) -> dict[str, Any]:
         **{name: column.tolist() for name, column in zip(COLUMNS, columns, strict=True)},
         "sensor": pattern.sensor.tolist(),
     }
+
+
+def digested(certificate: Mapping[str, Any], design: DesignSpec) -> dict[str, Any]:
+    """A certificate with the digest of its own figures and of the rays, gates and owners that it is for.
+
+    One that has another digest, or none, was changed or is for other rays.
+    """
+    pattern = design.pattern(certificate.get("rays", 0))
+    written = {**certificate, "digest": None if pattern is None else pattern_document(pattern)}
+    text = repr(sorted(written.items())).encode(errors="replace")
+    return {**certificate, "digest": hashlib.sha256(text).hexdigest()[:16]}
 
 
 def save_design(design: DesignSpec, path: Path) -> None:

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from support.designs import sensor
 
 from lidardesign.constraints.check import check_design
+from lidardesign.constraints.slack import broken_notes
 from lidardesign.sensors.bandwidth import Bandwidth, split_budget
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import design_document
@@ -162,6 +163,16 @@ def test_a_chosen_ray_that_looks_out_of_its_sensors_field_is_caught(document, se
     assert set(found) <= {f"s{sensor}.rays.horizontal_rad", f"s{sensor}.rays.vertical_rad"}
     # rays of real parts and rigs are what they are
     assert broken({**bad, "layout": "fixed"}) == []
+
+
+@pytest.mark.parametrize("document", [written, along])
+@pytest.mark.parametrize("axis", ["y", "z"])
+@pytest.mark.parametrize(("sensor", "by", "kept"), [(0, 0.25, True), (0, 0.3, False), (1, 0, True), (1, 1e-4, False)])
+def test_a_chosen_ray_starts_in_its_sensors_region_or_at_its_place(document, axis, sensor, by, kept):
+    bad = document()
+    bad["patterns"][0][f"origin_{axis}_m"][-1][40 * sensor] += by
+    assert broken(bad, {}) == ([] if kept else [f"s{sensor}.rays.origin_m"])
+    assert bool(broken_notes("d", check_design(bad, {}, SPACE))) != kept
 
 
 @pytest.mark.parametrize("end", ["start", "end"])

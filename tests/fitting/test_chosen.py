@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import re
 import shlex
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,8 +16,9 @@ from lidardesign.constraints.check import check_design
 from lidardesign.constraints.document import Constraints
 from lidardesign.density.objective.proposals import samples_without_visibility
 from lidardesign.errors import ConfigError
-from lidardesign.formats.designs import load_design
+from lidardesign.formats.designs import load_design, read_design
 from lidardesign.rays import training
+from lidardesign.run.yaml import dump_yaml
 from lidardesign.run_folder import RunFolder
 from lidardesign.samples import save_samples
 from lidardesign.sensors.bandwidth import Bandwidth
@@ -91,6 +93,17 @@ class TestDesignsWithChosenRays:
         assert again.specification.has_gates_per_ray == (gates == "ray")
 
 
+CHANGES = {
+    "a gap below zero": lambda certificate, pattern: certificate.update(gap=-0.5),
+    "a bound above the value": lambda certificate, pattern: certificate.update(bound=9 * certificate["value"] + 1),
+    "words for a number": lambda certificate, pattern: certificate.update(rays="nine"),
+    "no digest": lambda certificate, pattern: certificate.pop("digest"),
+    "a ray elsewhere": lambda certificate, pattern: pattern["azimuth_rad"][0].__setitem__(3, 0.25),
+    "another gate": lambda certificate, pattern: pattern["gate_end_m"][0].__setitem__(3, 3.25),
+    "another sensor": lambda certificate, pattern: pattern["sensor"].__setitem__(0, 1),
+}
+
+
 @pytest.fixture
 def fitted(lidardesign, run):
     """A design of nine rays, fitted by the command."""
@@ -132,13 +145,23 @@ class TestTheCommand:
         assert refused.code == 2
         assert "has no method informs" in refused.err
 
-    def test_leaves_damaged_certificates_out(self, lidardesign, fitted):
-        spec = load_design(fitted[0])
-        spec.certificates[0]["rays"] = "nine"
-        save_design(spec, fitted[0])
-        shown = lidardesign("show", fitted[0])
-        assert shown.code == 0
+    @pytest.mark.parametrize("change", CHANGES)
+    def test_leaves_certificates_out_that_are_damaged_or_of_other_rays(self, lidardesign, fitted, change):
+        document = design_document(load_design(fitted[0]))
+        CHANGES[change](document["certificates"][0], document["patterns"][0])
+        fitted[0].write_text(dump_yaml(document), encoding="utf-8")
+        shown, as_json = lidardesign("show", fitted[0]), lidardesign("show", fitted[0], "--json")
+        assert (shown.code, as_json.json["certificates"]) == (0, [])
         assert "rays chosen on training scenes" not in shown.out
+        assert "is of other rays or was changed: left out" in shown.err
+
+    def test_is_held_against_its_own_sensors_without_constraints(self, lidardesign, fitted):
+        spec = load_design(fitted[0])
+        moved = replace(spec.sensors[0], origin_m=spec.sensors[0].origin_m + 3.0)
+        save_design(replace(spec, sensors=(moved, *spec.sensors[1:])), fitted[0])
+        for words in ("show", fitted[0]), ("evaluate", fitted[0], "--set", "test=2", "--baseline", "none"):
+            told = lidardesign(*words)
+            assert "nine breaks s0.rays.origin_m" in f"{told.out}{told.err}"
 
 
 @pytest.fixture(scope="module")
@@ -156,6 +179,8 @@ def test_along_an_aisle_patterns_lead_all_the_way_and_keep_the_bandwidth_between
     design = chosen(aisle, constraints=rules).specification
     assert design.counts == sorted(open_run(aisle).task.defaults.rays)
     assert {pattern.ends for pattern in design.patterns} == {(space.low[0], space.high[0])}
+    save_design(design, aisle / "along.yaml")
+    assert read_design(aisle / "along.yaml").certificates == design.certificates != ()
     checks = check_design(design_document(design), Constraints.from_mapping(rules), space)
     assert all(check.satisfied for check in checks)
     for count in design.counts:

@@ -19,11 +19,11 @@ from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.fitting import part_design
 from lidardesign.fitting.part_sets import SetLimits, choose_set
 from lidardesign.fitting.part_shapes import COARSE_CELL_RAD, PartBundle, cells_of, part_table, parts_inform
+from lidardesign.formats.designs import read_design
 from lidardesign.parts.catalogue import FOLDER, find_part, load_library, part_rays
 from lidardesign.rays import information
 from lidardesign.samples import load_samples
-from lidardesign.sensors.design import certificates_of
-from lidardesign.sensors.design_file import design_document
+from lidardesign.sensors.design_file import design_document, save_design
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.detector.physics import Physics
 from lidardesign.simulate.returns import simulate_many
@@ -59,8 +59,9 @@ class TestDesignsOfParts:
     def test_are_the_same_for_the_same_seed(self, run):
         assert design_document(bought(run)) == design_document(bought(run))
 
-    def test_say_how_far_from_the_best_they_may_be(self, run):
-        (certificate,) = certificates_of(bought(run))
+    def test_say_how_far_from_the_best_they_may_be(self, run, tmp_path):
+        save_design(bought(run), tmp_path / "bought.yaml")
+        (certificate,) = read_design(tmp_path / "bought.yaml").certificates
         assert 0 <= certificate["bound"] <= certificate["value"]
         assert 0 <= certificate["gap"] <= 1
         assert certificate["scenes"] == 4
@@ -70,6 +71,22 @@ class TestDesignsOfParts:
         spec = bought(run, sensors=3, parts={"names": "catalog", "each": each})
         names = [sensor.part for sensor in spec.sensors]
         assert max(names.count(name) for name in each) <= 1
+
+    def test_count_all_modes_of_a_part_where_its_name_has_none(self, run):
+        each, document = {"vl53l5cx": {"max": 1}}, design_document(bought(run, sensors=3))
+        spec = bought(run, sensors=3, parts={"names": THREE, "each": each})
+        assert sum(sensor.part.startswith("vl53l5cx") for sensor in spec.sensors) == 1
+        for sensor, name in zip(document["sensors"], THREE, strict=True):
+            sensor["part"] = name
+        counted = [check.value for check in check_design(document, {"parts": {"each": each}}) if "each" in check.name]
+        assert counted == [2]
+
+    @pytest.mark.parametrize("part", ["nosuch", "vl53l8ch:64x64", "tmf8701"])
+    def test_are_the_parts_that_they_name_whether_parts_are_constrained_or_not(self, run, part):
+        document = design_document(bought(run))
+        assert all(check.satisfied for check in check_design(document, {}))
+        document["sensors"][1]["part"] = part
+        assert [check.name for check in check_design(document, {}) if not check.satisfied] == ["s1.part"]
 
     def test_look_where_they_may(self, run):
         middle = bought(run, sensors=1).sensors[0].azimuth_rad
@@ -145,7 +162,7 @@ class TestTheWorldAsItIs:
         monkeypatch.setattr(part_design.HeldBackScenes, "score", score)
         spec = open_run(run).fit(**ASKED, name="last").specification
         assert spec.sensors == tried[-1].design.sensors
-        (certificate,) = certificates_of(spec)
+        (certificate,) = spec.certificates
         assert certificate["bound"] <= certificate["value"]
 
     @pytest.mark.parametrize(

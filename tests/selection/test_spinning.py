@@ -16,10 +16,9 @@ from lidardesign.constraints.document import Constraints
 from lidardesign.errors import ConfigError
 from lidardesign.fitting import spinning
 from lidardesign.fitting.spinning import RingCandidates, chosen_rings, places_of, refine_elevations
-from lidardesign.formats.designs import load_design
+from lidardesign.formats.designs import read_design
 from lidardesign.numerics import FULL_TURN
 from lidardesign.rays.coverage import LARGEST
-from lidardesign.sensors.design import certificates_of
 from lidardesign.sensors.design_file import design_document, save_design
 from lidardesign.space import DesignSpace
 
@@ -102,11 +101,11 @@ class TestDesigns:
         assert vertical == pytest.approx(2 * np.abs(elevation).max())
         assert np.ptp(rays.azimuth_rad) == pytest.approx(FULL_TURN * 49 / 50)
         save_design(spec, tmp_path / "spun.yaml")
-        again = load_design(tmp_path / "spun.yaml")
+        again = read_design(tmp_path / "spun.yaml")
         assert design_document(again) == design_document(spec)
         np.testing.assert_array_equal(again.rays(150).direction, rays.direction)
         assert len(again.rays(75)) == 75
-        (entry,) = certificates_of(spec)
+        (entry,) = spec.certificates
         assert 0 <= entry["bound"] <= entry["value"]
         assert (entry["rays"], entry["candidates"], entry["gates"]) == (150, 15, 1)
 

@@ -51,7 +51,7 @@ def show(
             return _show_run(design, {"--at": at, "--in": space_of}, output)
         with phase("libraries"):
             from lidardesign.constraints.check import check_design
-            from lidardesign.constraints.slack import room_of
+            from lidardesign.constraints.slack import broken_notes, room_of
             from lidardesign.formats.designs import reach_beside, reach_of, read_design, run_of
             from lidardesign.run_folder import RunFolder
             from lidardesign.sensors.compare import outside_notes, readout_of
@@ -72,10 +72,11 @@ def show(
         except LidardesignError as error:  # its run is not needed to show a design
             if specification.constraints:
                 output.remark(f"the design space is not checked: {error}")
-        space, checks = None if run is None else run.config.space, []
-        if specification.constraints:
-            checks = check_design(design_document(specification), specification.constraints, space)
-        for line in () if space is None else outside_notes(specification, space):
+        space = None if run is None else run.config.space
+        bounds = space if specification.constraints else None
+        checks = check_design(design_document(specification), specification.constraints, bounds)
+        outside = [] if space is None else outside_notes(specification, space)
+        for line in (*outside, *broken_notes(specification.name, checks)):
             output.remark(line)
         specification = shown[0]
         reaches = []

@@ -58,8 +58,6 @@ def show_design(design: DesignSpec, rich: RichConsole) -> None:
 
 def _show_certificates(design: DesignSpec, rich: RichConsole) -> None:
     """Print the loss of chosen rays, and by how much any choice of the same candidates could lower it."""
-    from lidardesign.sensors.design import certificates_of
-
     columns = ("rays", "loss", "on other scenes", "less by at most", "candidates", "scenes")
     rows = [
         (
@@ -70,7 +68,7 @@ def _show_certificates(design: DesignSpec, rich: RichConsole) -> None:
             str(entry["candidates"]),
             str(entry["scenes"]),
         )
-        for entry in certificates_of(design)
+        for entry in design.certificates
     ]
     if rows:
         rich.print(text_table(columns, rows, "\nrays chosen on training scenes", columns))
@@ -214,11 +212,10 @@ def _frames(design: DesignSpec) -> str:
 
 def _show_choice(design: DesignSpec, rich: RichConsole) -> None:
     """Print the numbers of candidates and scenes of a choice, its loss and the lower bound of the loss."""
-    from lidardesign.sensors.design import MOST_GAP, certificates_of
+    from lidardesign.sensors.design import MOST_GAP
 
-    entries = certificates_of(design)
-    if entries:
-        last, are_parts = entries[-1], all(sensor.part is not None for sensor in design.sensors)
+    if design.certificates:
+        last, are_parts = design.certificates[-1], all(sensor.part is not None for sensor in design.sensors)
         what, count = ("poses of parts", len(design.sensors)) if are_parts else ("rays", last["rays"])
         text = f"chosen among {last['candidates']} {what} on {last['scenes']} training scenes"
         if last["gap"] <= MOST_GAP:

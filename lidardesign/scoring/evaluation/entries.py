@@ -28,7 +28,7 @@ from lidardesign.scoring.evaluation.request import EvaluationRequest, fired_numb
 from lidardesign.scoring.scene_scores import ONE_DEVICE, Devices, RaysPerCondition, score_scenes
 from lidardesign.sensors.adaptive import AdaptiveRays, mean_mbps
 from lidardesign.sensors.bandwidth import Bandwidth
-from lidardesign.sensors.design import DesignSpec, certificates_of
+from lidardesign.sensors.design import DesignSpec
 from lidardesign.simulate.detector.physics import EFFECTS
 from lidardesign.simulate.plan import Choice, EffectPlan, Tolerance
 from lidardesign.task import conditions_of
@@ -238,7 +238,7 @@ def _chosen(
     most: int,
     views: TrainingViews,
 ) -> Candidate:
-    numbers = [one["scenes"] for design in request.designs for one in certificates_of(design)]
+    numbers = [one["scenes"] for design in request.designs for one in design.certificates]
     return GreedyCandidate(
         views=views,
         spaces=[request.space.at(condition) for condition in conditions],

@@ -16,6 +16,8 @@ from typing import Any
 
 import numpy as np
 
+from lidardesign.constraints.check import check_design
+from lidardesign.constraints.slack import broken_notes
 from lidardesign.errors import BackgroundNote
 from lidardesign.estimates import (
     FEW_GROUPS,
@@ -38,6 +40,7 @@ from lidardesign.scoring.evaluation.results import Audit, Evaluation, Mounting, 
 from lidardesign.scoring.scene_scores import RaysPerCondition, score_scenes, silent_notes, without_each
 from lidardesign.sensors.adaptive import AdaptiveRays
 from lidardesign.sensors.compare import outside_notes
+from lidardesign.sensors.design_file import design_document
 from lidardesign.sensors.sensor import MOST_RAYS
 from lidardesign.simulate.calibration import light_notes
 from lidardesign.simulate.plan import EffectPlan, Planner
@@ -271,6 +274,7 @@ def _notes(request: EvaluationRequest, entries: Sequence[Entry], matched: Sequen
         notes += notes_of(request.task, request.config, request.space)
     for design in request.designs:
         notes += outside_notes(design, request.space) + light_notes(design, request.planner.detector)
+        notes += broken_notes(design.name, check_design(design_document(design), design.constraints, request.space))
     own = sorted((entry for entry in entries if not entry.baseline), key=lambda entry: entry.rays)
     shared = [entry for entry in own if entry.rays not in request.alone]
     # of each design the most rays, which come last
