@@ -124,6 +124,9 @@ class FitRequest:
         asked = load_constraints(options.constraints, notes=notes)
         if asked is None and base is not None:
             asked = Constraints()
+        given = None if asked is None or asked.parts is None else asked.parts.names
+        if options.parts is not None and given not in (None, "catalog", options.parts):
+            notes(f"--parts takes the place of parts.names: {', '.join(given)}")
         constraints, names = _with_rig(options, _with_survival(options, _with_parts(options, asked, run)), run, notes)
         rules, moved = snap_to_space(constraints or Constraints(), run.config.space)
         for note in moved:

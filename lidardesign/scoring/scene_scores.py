@@ -152,7 +152,7 @@ def checked_score(task: Task, metric: Metric, scene: Scene, returns: Sequence[Re
     A value beyond the worst one counts as the worst, so that failing is never better.
 
     Raises:
-        PluginError: The task's score raised, or returned something that is no finite score.
+        PluginError: The task's score raised, or returned something that is no finite score, or better than the best.
     """
     where = f"task {task.name}, metric {metric.name}, scene {scene.name}"
     with plugin_method(task.name, "scoring", where):
@@ -172,6 +172,15 @@ def checked_score(task: Task, metric: Metric, scene: Scene, returns: Sequence[Re
             where=where,
             allowed="a finite number",
             hint="where there are too few returns, return Score(metric.worst, failed=True)",
+        )
+    best = metric.limits[metric.better == "higher"]
+    beyond = best - score.value if metric.better == "lower" else score.value - best
+    if beyond > metric.tolerance:
+        raise PluginError(
+            f"score returned {score.value:g}",
+            where=where,
+            allowed=f"{best:g}, the best there can be, or worse",
+            hint="give the metric another best=",
         )
     clip = min if metric.better == "lower" else max
     return Score(clip(float(score.value), float(metric.worst)), details=dict(score.details))

@@ -240,6 +240,7 @@ class BrokenTask(MissTask):
         Score(float("inf")),
         Score("3"),
         Score(True),
+        Score(-1e9),
     ],
     ids=str,
 )

@@ -357,3 +357,10 @@ def test_a_part_keeps_its_own_entry_of_each_and_the_others_the_common_rules(run)
     ):
         with pytest.raises(InfeasibleError, match=words):
             bought(run, each=[entry])
+
+
+def test_parts_of_an_option_in_place_of_those_of_a_file_are_said(run):
+    notes = []
+    rules = {"parts": {"names": ["tmf8820"], "count": 1}}
+    open_run(run).fit(parts=["vl53l8cx"], constraints=rules, notes=notes.append)
+    assert any("takes the place" in str(note) and "tmf8820" in str(note) for note in notes)
