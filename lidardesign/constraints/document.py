@@ -34,7 +34,7 @@ from pydantic import (
 )
 
 from lidardesign.errors import UNSET_HINT, ConfigError
-from lidardesign.run.validation import apply_override, check_model, parse_override
+from lidardesign.run.validation import apply_override, check_model, parse_override, parse_overrides
 from lidardesign.run.yaml import Document, KeyPath, leaves, load_yaml
 from lidardesign.run_folder import Notes, log_note
 from lidardesign.sensors.sensor import MOST_RAYS
@@ -374,8 +374,7 @@ def load_constraints(
     if given and all(value in (None, {}, []) for _, value in leaves(values)):
         notes(f"{document.where} holds no constraints")
     origins: dict[KeyPath, str] = {}
-    for text in overrides:
-        override = parse_override(text)
+    for override in parse_overrides(overrides):
         origins[apply_override(values, override)] = override.where
 
     def locate(path: KeyPath, *, key: bool = False) -> str:
