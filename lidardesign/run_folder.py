@@ -100,7 +100,7 @@ class RunFolder:
             return list(scenes_of(self.task, self.config.task, split, seed, self.config.space))
 
     def input_notes(self) -> list[str]:
-        """Notes on input files that changed or were added since the run was learned."""
+        """Notes on input files that changed, went or were added since the run was learned."""
         task, before = self.config.task, read_manifest(self.folder).get(INPUTS) or {}
         now = input_hashes(task) if before else {}
         moved = {name: digest for name, digest in before.items() if now.get(name) != digest}
@@ -112,9 +112,12 @@ class RunFolder:
         renamed = {digest for name, digest in moved.items() if is_kept(name)} & {*now.values()}
         changed = [name for name, digest in moved.items() if digest not in renamed]
         notes = []
-        if changed:
-            more = "" if len(changed) == 1 else f" and {len(changed) - 1} more"
-            notes.append(f"{changed[0]}{more} changed since {self.folder} was learned: its scenes are different now")
+        for gone in (False, True):
+            names = [name for name in changed if Path(name).exists() != gone]
+            if names:
+                more = "" if len(names) == 1 else f" and {len(names) - 1} more"
+                what = f"{'are' if more else 'is'} gone" if gone else "changed"
+                notes.append(f"{names[0]}{more} {what} since {self.folder} was learned: its scenes are different now")
         came = [
             Path(name).name
             for name, digest in now.items()

@@ -25,7 +25,7 @@ from lidardesign.scenes.mesh_files import COLOURS, SUFFIXES, Y_UP, Painted, list
 from lidardesign.scenes.rays import Returns
 from lidardesign.scenes.scene import Body, Mesh, Scene, Sign
 from lidardesign.space import FARTHEST_M, DesignSpace
-from lidardesign.task import Defaults, FolderConfig, Information, Metres, Metric, Score, Split, Vector, random_generator
+from lidardesign.task import Defaults, FolderConfig, Information, Metric, Score, Split, Vector, random_generator
 from lidardesign_tasks.importance import WEIGHING_KEYS, Importance, middle_of_origins
 from lidardesign_tasks.motion import Motion, load_motion, moved_bounds_m
 from lidardesign_tasks.moving_surface import SURFACES, moving_informs, moving_score, with_moving_truth
@@ -40,7 +40,7 @@ from lidardesign_tasks.surface import (
 )
 from lidardesign_tasks.surroundings import any_direction
 from lidardesign_tasks.units import doubtful_meshes, doubtful_motion
-from lidardesign_tasks.view import space_around, space_around_box
+from lidardesign_tasks.view import OriginBox, space_around, space_around_box
 
 Axis = Literal["format", "x", "y", "z"]
 # the file's axes that become the world's x, y, z: a rotation of the up axis to z
@@ -85,7 +85,7 @@ class MeshesConfig(FolderConfig, Importance):
     )
     occluders: Path | None = Field(None, description="folder of meshes that block the view, in world coordinates")
     origin_m: Vector | None = Field(None, description="place of the sensor [m]; if empty: in front, 2 extents away")
-    origin_box_m: Metres | Vector = Field(0.0, description="half size of the box of sensor origins [m]; 0: fixed")
+    origin_box_m: OriginBox = Field(0.0, description="half size of the box of sensor origins [m]; 0: fixed")
     truth_points: int = Field(
         5000, ge=100, le=200_000, description="points of the visible surface that scores compare with"
     )
@@ -395,7 +395,7 @@ def derived_space(config: MeshesConfig, named: Sequence[tuple[str, Mesh]], motio
 
     For a pile it is the box around it instead of the sphere.
     """
-    half = np.broadcast_to(np.abs(np.asarray(config.origin_box_m, dtype=np.float64)), 3)
+    half = np.broadcast_to(np.asarray(config.origin_box_m, dtype=np.float64), 3)
     background = pile_of(config, named)
     if background is not None:
         bounds_m, up = background.bounds_m, math.radians(ABOVE_DEG)
