@@ -111,7 +111,7 @@ class RunFolder:
         # files of folders are identified by content, under any name
         renamed = {digest for name, digest in moved.items() if is_kept(name)} & {*now.values()}
         changed = [name for name, digest in moved.items() if digest not in renamed]
-        notes = []
+        notes = task.twin_notes() if isinstance(task, FolderConfig) else []
         for gone in (False, True):
             names = [name for name in changed if Path(name).exists() != gone]
             if names:

@@ -103,6 +103,12 @@ class MeshesConfig(FolderConfig, Importance):
         10.0, gt=1e-3, le=1e3, description="how many times as much white counts as black, with importance=colours"
     )
 
+    def held_out(self, files: Sequence[Path]) -> Sequence[Path]:
+        """A share of the meshes, the same for all seeds; none of a single one."""
+        files = [file for file in files if file.parent == self.folder]
+        order = random_generator(SPLIT_SEED, "meshes", "split").permutation(len(files))
+        return [files[i] for i in order[: min(max(round(self.test_share * len(files)), 1), len(files) - 1)]]
+
     @model_validator(mode="after")
     def _contrast_of_colours(self) -> MeshesConfig:
         if self.importance != COLOURS and self.colour_contrast != type(self).model_fields["colour_contrast"].default:
@@ -363,10 +369,8 @@ def split_meshes(meshes: Sequence[tuple[str, Mesh]], config: MeshesConfig, split
     names = list(config.learned_files(list_mesh_files(config.folder)))
     if len(names) == 1:
         return list(meshes)
-    order = random_generator(SPLIT_SEED, "meshes", "split").permutation(len(names))
-    held_out = min(max(round(config.test_share * len(names)), 1), len(names) - 1)
-    chosen = {names[i] for i in (order[:held_out] if split == "test" else order[held_out:])}
-    kept = [(name, mesh) for name, mesh in meshes if name in chosen]
+    held_out = {path.name for path in config.held_out([config.folder / name for name in names])}
+    kept = [(name, mesh) for name, mesh in meshes if (name in held_out) == (split == "test")]
     if not kept:
         which, hint = "held-out" if split == "test" else "training", "put them back, or learn again"
         raise DataError(f"holds none of the {which} meshes of the run", where=str(config.folder), hint=hint)

@@ -33,6 +33,7 @@ from lidardesign.task import (
 from lidardesign_tasks.robot.measures import METRICS, TOLERATED_SHARE, Measure, features, informs, score, with_truth
 from lidardesign_tasks.robot.motion import (
     Trajectory,
+    held_out,
     keyframes,
     wandering,
     window_frames,
@@ -89,6 +90,10 @@ class MujocoConfig(FolderConfig, MovingSurroundings):
     frame_rate_hz: float = Field(10.0, gt=0, le=10_000, description="frames per second [Hz]")
     train: int = Field(40, ge=1, le=10_000, description="training scenes")
     test: int = Field(40, ge=1, le=10_000, description="held-out scenes")
+
+    def held_out(self, files: Sequence[Path]) -> Sequence[Path]:
+        """Half of several recordings."""
+        return [files[i] for i in held_out(len(files))]
 
 
 class MujocoTask:
