@@ -21,6 +21,7 @@ from lidardesign.constraints.document import MOST_ROLL_DEG, Constraints, SensorR
 from lidardesign.constraints.origins import free_boxes, most_mounted, mounts_of, snap_place_to_space
 from lidardesign.errors import InfeasibleError
 from lidardesign.numerics import COARSE_SLACK, SLACK
+from lidardesign.run.yaml import leaves
 from lidardesign.sensors.bandwidth import Bandwidth, split_budget
 from lidardesign.space import AZIMUTH, DIMENSIONS, ELEVATION, RANGE, DesignSpace
 
@@ -29,6 +30,8 @@ AGREEMENT = SLACK
 # A cap of n bins is this share narrower, so that its width never rounds up to n + 1 bins.
 BIN_MARGIN = COARSE_SLACK
 MOST_REFITS = 12
+# Lengths beyond so many times the space, and smaller fields of view, are probably in another unit.
+DOUBTFUL_TIMES, DOUBTFUL_DEG = 10.0, 1.0
 
 Fitted = TypeVar("Fitted")
 
@@ -101,6 +104,19 @@ def check_feasible(
         _check_field(rules, space)
         _check_gate(rules, space)
     _check_budget(constraints, needed, least, rays)
+
+
+def unit_notes(constraints: Constraints, space: DesignSpace) -> list[str]:
+    """Questions about bounds that are probably in millimetres or radians: far beyond the space, or below a degree."""
+    most_m = max(map(abs, (*space.low[:3], *space.high[:3], space.high[RANGE])))
+    notes = []
+    for path, value in leaves(constraints.as_document()):
+        name = ".".join(map(str, path))
+        if "_m." in f"{name}." and "exclude" not in path and abs(value) > DOUBTFUL_TIMES * most_m:
+            notes.append(f"{name}={value:g} is far beyond the design space, of at most {most_m:.4g} m: in millimetres?")
+        elif path[-3:-2] == ("field_of_view",) and 0 < value < DOUBTFUL_DEG:
+            notes.append(f"{name}={value:g} is less than {DOUBTFUL_DEG:g} degree: in radians?")
+    return notes
 
 
 def _refuse(message: str, conflicts: Sequence[str]) -> None:
