@@ -176,9 +176,7 @@ def _unchanged_process() -> Iterator[None]:
     os.umask(mask)
 
     def leave(status: int) -> NoReturn:
-        if os.getpid() != process:
-            end(status)
-        raise SystemExit(status)
+        raise SystemExit(status if os.getpid() == process else end(status))
 
     os._exit = leave
     try:

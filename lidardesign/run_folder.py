@@ -112,23 +112,17 @@ class RunFolder:
         renamed = {digest for name, digest in moved.items() if is_kept(name)} & {*now.values()}
         changed = [name for name, digest in moved.items() if digest not in renamed]
         notes = task.twin_notes() if isinstance(task, FolderConfig) else []
-        for gone in (False, True):
-            names = [name for name in changed if Path(name).exists() != gone]
-            if names:
-                more = "" if len(names) == 1 else f" and {len(names) - 1} more"
-                what = f"{'are' if more else 'is'} gone" if gone else "changed"
-                notes.append(f"{names[0]}{more} {what} since {self.folder} was learned: its scenes are different now")
+        if changed:
+            named = _named([f"{name} {'changed' if Path(name).exists() else 'is gone'}" for name in changed])
+            notes.append(f"{named} since {self.folder} was learned: its scenes are different now")
         came = [
             Path(name).name
             for name, digest in now.items()
             if is_kept(name) and before.get(name) != digest and name not in changed and digest not in renamed
         ]
         if came:
-            more = f" and {len(came) - MOST_NAMED} more" if len(came) > MOST_NAMED else ""
-            named = ", ".join(came[:MOST_NAMED]) + more
-            notes.append(
-                f"{named}: added after {self.folder} was learned, so left out; learn again to include what is new"
-            )
+            left_out = f"added after {self.folder} was learned, so left out; learn again to include what is new"
+            notes.append(f"{_named(came)}: {left_out}")
         return notes
 
     def design_paths(self) -> list[Path]:
@@ -150,6 +144,11 @@ class RunFolder:
             # entries of older versions have no phases
             if isinstance(seconds, dict) and all(isinstance(value, int | float) for value in seconds.values())
         }
+
+
+def _named(names: Sequence[str]) -> str:
+    """The first of some names, and how many more there are."""
+    return ", ".join(names[:MOST_NAMED]) + (f" and {len(names) - MOST_NAMED} more" if names[MOST_NAMED:] else "")
 
 
 def input_paths(config: BaseModel) -> list[Path]:

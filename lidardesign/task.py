@@ -64,8 +64,7 @@ class FolderConfig(TaskConfig):
         held = self.held_out(list(files))
         learned = {digest: path.name for path, digest in files.items() if path not in held}
         twins = [f"{path.name} and {learned[files[path]]}" for path in held if files[path] in learned]
-        text = "equal files are held out and learned from, so scores say less of new ones: "
-        return [text + "; ".join(twins)] if twins else []
+        return [f"equal files are held out and learned from, so scores flatter: {'; '.join(twins)}"] if twins else []
 
     def learned_files(self, files: Sequence[Path]) -> dict[str, Path | None]:
         """Files of a folder by the names that they had when the run was learned, in that order; None for missing ones.

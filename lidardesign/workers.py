@@ -158,9 +158,8 @@ def _processes(count: int) -> Iterator[tuple[Executor, Callable[[], int]]]:
 
 def _end_with_parent() -> None:
     """End a worker as soon as its parent process has gone, even during a scene."""
-    end = os._exit  # not the one that a plugin finds
 
-    def watch() -> None:
+    def watch(end: Callable[[int], object] = os._exit) -> None:  # as it is before a plugin runs
         multiprocessing.parent_process().join()
         end(1)
 

@@ -351,10 +351,9 @@ def _key_paths(values: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
 
 def split_settings(overrides: Sequence[str], task: Task) -> tuple[list[str], list[str]]:
     """Texts KEY=VALUE that are constraints, and those whose first key is no section of these but a task's own."""
-    firsts = [str(parse_override(text).path[0]) for text in overrides]
-    own = {key for key in firsts if key in task.Config.model_fields and key not in Constraints.model_fields}
-    texts = list(zip(firsts, overrides, strict=True))
-    return [text for key, text in texts if key not in own], [text for key, text in texts if key in own]
+    own_keys = task.Config.model_fields.keys() - Constraints.model_fields.keys()
+    own = {text for text in overrides if parse_override(text).path[0] in own_keys}
+    return [text for text in overrides if text not in own], [text for text in overrides if text in own]
 
 
 def load_constraints(

@@ -153,8 +153,8 @@ def load_model(
     _check_places(model, path)
     if root.find("mujoco/compiler[@discardvisual='true']") is not None:
         collected.append("visual shapes are discarded, so rays meet the collision shapes")
-    for number in np.flatnonzero(model.jnt_range[:, 0] > model.jnt_range[:, 1]).tolist():
-        collected.append(f"the range of joint {model.joint(number).name!r} ends below its start: no limits are known")
+    upside_down = [model.joint(number).name for number, (low, high) in enumerate(model.jnt_range) if low > high]
+    collected += [f"the range of joint {name!r} ends below its start, so it has no limits" for name in upside_down]
     lines = dict.fromkeys(" ".join(str(line).split()) for line in (*collected, *(one.message for one in caught)))
     return model, tuple(f"{path.name}: MuJoCo warns: {line}" for line in lines)
 

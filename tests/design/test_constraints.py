@@ -208,12 +208,13 @@ NEAR = DesignSpace((0.4, 0.0, 0.0, 2.6, -0.5, 0.05), (0.4, 0.0, 0.0, 3.7, 0.5, 1
 @each_row(
     ("override", "question"),
     [
-        ("gate.end_m.max=500", "gate.end_m.max=500 .* at most 1.05 m: in millimetres"),
+        ("gate.end_m.max=500", "gate.end_m.max=500 .* design space: in millimetres"),
         ("gate.width_m.max=100", "millimetres"),
         ("origin.low_m=[-1000, -1, -1]", "origin.low_m.0=-1000 .*millimetres"),
         ("each=[{gate: {end_m: {max: 500}}}]", "each.0.gate.end_m.max=500"),
         ("field_of_view.vertical_deg.max=0.35", "field_of_view.vertical_deg.max=0.35 .*radians"),
         ("gate.end_m.max=5", None),
+        ("field_of_view={}", None),
         ("field_of_view.vertical_deg={min: 0, max: 35}", None),
         ("origin.exclude=[{low_m: [-1000, -1000, 1], high_m: [1000, 1000, 1000]}]", None),
         ("budget.bandwidth_mbps=1000", None),
