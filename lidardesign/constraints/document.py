@@ -351,9 +351,9 @@ def _key_paths(values: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
 
 def split_settings(overrides: Sequence[str], task: Task) -> tuple[list[str], list[str]]:
     """Texts KEY=VALUE that are constraints, and those whose first key is no section of these but a task's own."""
-    own_keys = task.Config.model_fields.keys() - Constraints.model_fields.keys()
-    own = {text for text in overrides if parse_override(text).path[0] in own_keys}
-    return [text for text in overrides if text not in own], [text for text in overrides if text in own]
+    keys = task.Config.model_fields.keys() - Constraints.model_fields.keys()
+    own = [text for text in overrides if parse_override(text).path[0] in keys]
+    return [text for text in overrides if text not in own], own
 
 
 def load_constraints(
