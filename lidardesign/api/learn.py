@@ -98,8 +98,9 @@ class LearnOptions:
     def overrides(self) -> tuple[str, ...]:
         """The settings, those that a tolerance stands for, and those of a time budget where none of them is set."""
         endless = () if self.time_budget_s is None else (f"learning.steps={MOST_STEPS}", "learning.misplaced=0")
-        given = settings_texts(self.settings)
-        given += () if self.tolerance is None else (f"learning.misplaced={self.tolerance}",)
+        given = settings_texts(self.settings) + (
+            () if self.tolerance is None else (f"learning.misplaced={self.tolerance}",)
+        )
         return *(text for text in endless if not any(one.startswith(text.split("=")[0]) for one in given)), *given
 
 
