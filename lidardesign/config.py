@@ -20,7 +20,7 @@ from lidardesign.numerics import COARSE_SLACK
 from lidardesign.registry import UnknownTaskError, load_task, plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.run.manifest import read_manifest, verify, write_recorded
-from lidardesign.run.validation import Override, anchor_paths, apply_override, check_model, is_name, parse_override
+from lidardesign.run.validation import Override, anchor_paths, apply_override, check_model, is_name, parse_overrides
 from lidardesign.run.yaml import Document, KeyPath, dump_yaml, leaves, load_yaml
 from lidardesign.space import DIMENSIONS, FARTHEST_M, SHORTEST_M, DesignSpace
 from lidardesign.task import Task, TaskConfig
@@ -241,8 +241,8 @@ def resolve(
     layers.merge("density", task.defaults.density, f"defaults of task {task.name}")
     layers.merge("learning", task.defaults.learning.get(header["preset"], {}), f"defaults of task {task.name}")
     _lay_file(layers, task, document)
-    for text in overrides:
-        _lay_override(layers, task, parse_override(text))
+    for override in parse_overrides(overrides):
+        _lay_override(layers, task, override)
     return _build(task, header, layers)
 
 
@@ -254,8 +254,7 @@ def with_task_settings(task: Task, config: RunConfig, overrides: Sequence[str], 
     """
     layers = _Layers({section: {} for section in SECTIONS})
     layers.merge("task", config.task.model_dump(mode="json"), FILE_NAME)
-    for text in overrides:
-        override = parse_override(text, option)
+    for override in parse_overrides(overrides, option):
         first = str(override.path[0])
         learned = [name for name in SECTIONS[1:] if first in _models(task)[name].model_fields]
         if (first in SECTIONS[1:] and len(override.path) > 1) or (learned and first not in task.Config.model_fields):

@@ -17,7 +17,7 @@ import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, distributions, entry_points
-from typing import Any
+from typing import Any, NoReturn
 
 from lidardesign.errors import ConfigError, DataError, LidardesignError, PluginError
 from lidardesign.run.child import START_SECONDS, Child, ChildError
@@ -152,7 +152,7 @@ def plugin_guard(name: str) -> Iterator[None]:
     Its output goes to stderr, so that it cannot corrupt a command's output.
     """
     try:
-        with contextlib.redirect_stdout(sys.stderr):
+        with _unchanged_process(), contextlib.redirect_stdout(sys.stderr):
             yield
     except (LidardesignError, KeyboardInterrupt, GeneratorExit, MemoryError):
         raise
@@ -167,6 +167,26 @@ def plugin_guard(name: str) -> Iterator[None]:
             where=f"task {name}",
             hint=f"LIDARDESIGN_DEBUG=1 shows where; {AUTHOR_HINT}",
         ) from error
+
+
+@contextlib.contextmanager
+def _unchanged_process() -> Iterator[None]:
+    """Put folder and umask back; `os._exit` raises SystemExit, and a process that was forked meanwhile ends."""
+    process, end, mask = os.getpid(), os._exit, os.umask(0o077)
+    os.umask(mask)
+
+    def leave(status: int) -> NoReturn:
+        raise SystemExit(status if os.getpid() == process else end(status))
+
+    os._exit = leave
+    try:
+        with contextlib.chdir("."):
+            yield
+    finally:
+        if os.getpid() != process:
+            end(0)
+        os._exit = end
+        os.umask(mask)
 
 
 @contextlib.contextmanager

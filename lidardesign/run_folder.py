@@ -100,7 +100,7 @@ class RunFolder:
             return list(scenes_of(self.task, self.config.task, split, seed, self.config.space))
 
     def input_notes(self) -> list[str]:
-        """Notes on input files that changed or were added since the run was learned."""
+        """Notes on input files that changed, went or were added since the run was learned."""
         task, before = self.config.task, read_manifest(self.folder).get(INPUTS) or {}
         now = input_hashes(task) if before else {}
         moved = {name: digest for name, digest in before.items() if now.get(name) != digest}
@@ -111,21 +111,18 @@ class RunFolder:
         # files of folders are identified by content, under any name
         renamed = {digest for name, digest in moved.items() if is_kept(name)} & {*now.values()}
         changed = [name for name, digest in moved.items() if digest not in renamed]
-        notes = []
+        notes = task.twin_notes() if isinstance(task, FolderConfig) else []
         if changed:
-            more = "" if len(changed) == 1 else f" and {len(changed) - 1} more"
-            notes.append(f"{changed[0]}{more} changed since {self.folder} was learned: its scenes are different now")
+            named = _named([f"{name} {'changed' if Path(name).exists() else 'is gone'}" for name in changed])
+            notes.append(f"{named} since {self.folder} was learned: its scenes are different now")
         came = [
             Path(name).name
             for name, digest in now.items()
             if is_kept(name) and before.get(name) != digest and name not in changed and digest not in renamed
         ]
         if came:
-            more = f" and {len(came) - MOST_NAMED} more" if len(came) > MOST_NAMED else ""
-            named = ", ".join(came[:MOST_NAMED]) + more
-            notes.append(
-                f"{named}: added after {self.folder} was learned, so left out; learn again to include what is new"
-            )
+            left_out = f"added after {self.folder} was learned, so left out; learn again to include what is new"
+            notes.append(f"{_named(came)}: {left_out}")
         return notes
 
     def design_paths(self) -> list[Path]:
@@ -147,6 +144,11 @@ class RunFolder:
             # entries of older versions have no phases
             if isinstance(seconds, dict) and all(isinstance(value, int | float) for value in seconds.values())
         }
+
+
+def _named(names: Sequence[str]) -> str:
+    """The first of some names, and how many more there are."""
+    return ", ".join(names[:MOST_NAMED]) + (f" and {len(names) - MOST_NAMED} more" if names[MOST_NAMED:] else "")
 
 
 def input_paths(config: BaseModel) -> list[Path]:

@@ -54,6 +54,18 @@ class FolderConfig(TaskConfig):
         keys = [key for key, endings in self.folders.items() if path.suffix.lower() in endings]
         return not path.name.startswith(".") and any(path.parent == getattr(self, key) for key in keys)
 
+    def held_out(self, files: Sequence[Path]) -> Sequence[Path]:
+        """Those files, given by name, that only held-out scenes show; a task that splits files says which."""
+        return ()
+
+    def twin_notes(self) -> list[str]:
+        """A note that names held-out files that are equal to files that are learned from; empty without any."""
+        files = {Path(path): digest for path, digest in sorted(self.inputs.items()) if self.reads(Path(path))}
+        held = self.held_out(list(files))
+        learned = {digest: path.name for path, digest in files.items() if path not in held}
+        twins = [f"{path.name} and {learned[files[path]]}" for path in held if files[path] in learned]
+        return [f"equal files are held out and learned from, so scores flatter: {'; '.join(twins)}"] if twins else []
+
     def learned_files(self, files: Sequence[Path]) -> dict[str, Path | None]:
         """Files of a folder by the names that they had when the run was learned, in that order; None for missing ones.
 
@@ -317,17 +329,15 @@ def _quantity(metric: Metric) -> str:
 
 
 def notes_of(task: Task, config: Any, space: DesignSpace) -> list[str]:
-    """Notes of a task on its configuration in a design space, one line each; none without `notes`.
+    """Notes of a task on its configuration in a design space, one line each, and those on equal files.
 
     Raises:
         PluginError: The task returned something else.
     """
-    if not hasattr(task, "notes"):
-        return []
-    found = task.notes(config, space)
+    found = task.notes(config, space) if hasattr(task, "notes") else []
     if isinstance(found, str) or not all(isinstance(line, str) for line in found):
         raise PluginError(f"notes gave {found!r}", where=f"task {task.name}", allowed="a list of lines of text")
-    return list(found)
+    return [*found, *(config.twin_notes() if isinstance(config, FolderConfig) else ())]
 
 
 def scoring_settings(task: Task, config: Any) -> dict[str, Any]:

@@ -159,9 +159,9 @@ def _processes(count: int) -> Iterator[tuple[Executor, Callable[[], int]]]:
 def _end_with_parent() -> None:
     """End a worker as soon as its parent process has gone, even during a scene."""
 
-    def watch() -> None:
+    def watch(end: Callable[[int], object] = os._exit) -> None:  # as it is before a plugin runs
         multiprocessing.parent_process().join()
-        os._exit(1)
+        end(1)
 
     threading.Thread(target=watch, daemon=True).start()
 

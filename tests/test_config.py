@@ -22,7 +22,7 @@ from lidardesign.errors import ConfigError, DataError
 from lidardesign.parts.statements import PartFile
 from lidardesign.registry import list_tasks, load_task
 from lidardesign.run.manifest import start_manifest, write_recorded
-from lidardesign.run.validation import parse_override
+from lidardesign.run.validation import parse_override, parse_overrides
 from lidardesign.run.yaml import dump_yaml
 from lidardesign.space import DIMENSIONS, DesignSpace
 from lidardesign.task import Defaults, Metric, TaskConfig
@@ -91,7 +91,7 @@ def test_later_layers_win_over_earlier_ones(write):
     assert resolved.density.sigma_m == 1e-3
     resolved = resolve(TASK, config_file=file, overrides=["learning.steps=99"], seed=6, preset="fine")
     assert (resolved.preset, resolved.seed, resolved.learning.steps) == ("fine", 6, 99)
-    assert resolve(TASK, overrides=["learning.steps=1", "learning.steps=2"]).learning.steps == 2
+    assert resolve(TASK, overrides=["learning.steps=2", "learning.steps=2"]).learning.steps == 2
 
 
 def test_a_bare_or_unknown_first_key_belongs_to_the_task():
@@ -321,6 +321,14 @@ def test_what_was_learned_stays_when_a_run_is_judged(override, message):
     with pytest.raises(ConfigError, match=message) as caught:
         with_task_settings(TASK, resolve(TASK), [override])
     assert override in str(caught.value.where)
+
+
+@each_row("texts", [("a=1", "a=2"), ("task.a=1", "a=2"), ("a.b=1", "a={b: 2}"), ("a={b: 1}", "b=1", "a.b.c=2")])
+def test_a_key_that_is_set_twice_is_refused(texts):
+    with pytest.raises(ConfigError, match="is already set by --set") as caught:
+        parse_overrides(texts)
+    assert caught.value.where == f"--set {texts[-1]}"
+    assert len(parse_overrides(["d.b=1", "d.c=1", "db=2", *texts[:1], *texts[:1]])) == 5
 
 
 @each_row("text", [".".join("a" * count) + "=1" for count in (33, 500, 5000)])

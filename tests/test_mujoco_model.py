@@ -208,6 +208,14 @@ def test_a_urdf_finds_the_meshes_of_its_package_and_shows_its_visual_shapes(tmp_
     assert "visual shapes are discarded" in notes[0]
 
 
+def test_a_range_that_ends_below_its_start_is_told(tmp_path):
+    joint = '<body><joint name="lift" range="60 -60"/><geom size="1"/></body>'
+    (tmp_path / "lift.xml").write_text(f"<mujoco><worldbody>{joint}</worldbody></mujoco>")
+    model, notes = load_model(tmp_path / "lift.xml")
+    assert not model.jnt_limited.any()
+    assert "the range of joint 'lift' ends below its start" in notes[0]
+
+
 BAD = {
     "a missing file": (None, "cannot be read"),
     "no XML": ("hello", "is not XML"),
@@ -254,6 +262,14 @@ BAD = {
     "keyframes without end": ('<mujoco><size nkey="1000000000"/></mujoco>', "nkey is 1000000000"),
     "numbers without end": ('<mujoco><size nuser_geom="100000000"/></mujoco>', "nuser_geom is 100000000"),
     "levels without end": ("<mujoco>" + "<worldbody>" * 5000, "nested too deep"),
+    **{
+        f"a range of {low}": (
+            '<mujoco><worldbody><body><joint name="lift" limited="true" range="'
+            f'{low} {high}"/><geom size="1"/></body></worldbody></mujoco>',
+            "jnt_range of 'lift' is",
+        )
+        for low, high in (("-inf", "inf"), ("nan", "nan"), ("-1e300", "1e300"))
+    },
     "a place that is no number": (
         '<mujoco><worldbody><geom name="g" pos="nan 0 0" size="1"/></worldbody></mujoco>',
         "geom_pos of 'g' is nan 0.0 0.0",

@@ -96,10 +96,12 @@ class LearnOptions:
 
     @property
     def overrides(self) -> tuple[str, ...]:
-        """The settings, and those that a time budget and a tolerance stand for."""
+        """The settings, those that a tolerance stands for, and those of a time budget where none of them is set."""
         endless = () if self.time_budget_s is None else (f"learning.steps={MOST_STEPS}", "learning.misplaced=0")
-        reached = () if self.tolerance is None else (f"learning.misplaced={self.tolerance}",)
-        return (*endless, *settings_texts(self.settings), *reached)
+        given = settings_texts(self.settings) + (
+            () if self.tolerance is None else (f"learning.misplaced={self.tolerance}",)
+        )
+        return *(text for text in endless if not any(one.startswith(text.split("=")[0]) for one in given)), *given
 
 
 @dataclass(frozen=True, eq=False)

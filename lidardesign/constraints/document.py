@@ -34,7 +34,7 @@ from pydantic import (
 )
 
 from lidardesign.errors import UNSET_HINT, ConfigError
-from lidardesign.run.validation import apply_override, check_model, parse_override
+from lidardesign.run.validation import apply_override, check_model, parse_override, parse_overrides
 from lidardesign.run.yaml import Document, KeyPath, leaves, load_yaml
 from lidardesign.run_folder import Notes, log_note
 from lidardesign.sensors.sensor import MOST_RAYS
@@ -351,10 +351,9 @@ def _key_paths(values: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
 
 def split_settings(overrides: Sequence[str], task: Task) -> tuple[list[str], list[str]]:
     """Texts KEY=VALUE that are constraints, and those whose first key is no section of these but a task's own."""
-    firsts = [str(parse_override(text).path[0]) for text in overrides]
-    own = {key for key in firsts if key in task.Config.model_fields and key not in Constraints.model_fields}
-    texts = list(zip(firsts, overrides, strict=True))
-    return [text for key, text in texts if key not in own], [text for key, text in texts if key in own]
+    keys = task.Config.model_fields.keys() - Constraints.model_fields.keys()
+    own = [text for text in overrides if parse_override(text).path[0] in keys]
+    return [text for text in overrides if text not in own], own
 
 
 def load_constraints(
@@ -374,8 +373,7 @@ def load_constraints(
     if given and all(value in (None, {}, []) for _, value in leaves(values)):
         notes(f"{document.where} holds no constraints")
     origins: dict[KeyPath, str] = {}
-    for text in overrides:
-        override = parse_override(text)
+    for override in parse_overrides(overrides):
         origins[apply_override(values, override)] = override.where
 
     def locate(path: KeyPath, *, key: bool = False) -> str:

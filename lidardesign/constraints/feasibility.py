@@ -21,6 +21,7 @@ from lidardesign.constraints.document import MOST_ROLL_DEG, Constraints, SensorR
 from lidardesign.constraints.origins import free_boxes, most_mounted, mounts_of, snap_place_to_space
 from lidardesign.errors import InfeasibleError
 from lidardesign.numerics import COARSE_SLACK, SLACK
+from lidardesign.run.yaml import leaves
 from lidardesign.sensors.bandwidth import Bandwidth, split_budget
 from lidardesign.space import AZIMUTH, DIMENSIONS, ELEVATION, RANGE, DesignSpace
 
@@ -29,6 +30,8 @@ AGREEMENT = SLACK
 # A cap of n bins is this share narrower, so that its width never rounds up to n + 1 bins.
 BIN_MARGIN = COARSE_SLACK
 MOST_REFITS = 12
+# Lengths beyond so many times the space, and smaller fields of view, are probably in another unit.
+DOUBTFUL_TIMES, DOUBTFUL_DEG = 10.0, 1.0
 
 Fitted = TypeVar("Fitted")
 
@@ -101,6 +104,17 @@ def check_feasible(
         _check_field(rules, space)
         _check_gate(rules, space)
     _check_budget(constraints, needed, least, rays)
+
+
+def unit_notes(constraints: Constraints, space: DesignSpace) -> list[str]:
+    """Questions about bounds that are probably in millimetres or radians: far beyond the space, or below a degree."""
+    most_m = DOUBTFUL_TIMES * max(map(abs, (*space.low[:3], *space.high[:3], space.high[RANGE])))
+    given = [(".".join(map(str, path)), value) for path, value in leaves(constraints.as_document())
+             if isinstance(value, int | float) and "exclude" not in path]  # fmt: skip
+    far = [f"{name}={value:g} is far beyond the design space: in millimetres?" for name, value in given
+           if "_m." in f"{name}." and abs(value) > most_m]  # fmt: skip
+    return far + [f"{name}={value:g} is a very small angle: in radians?" for name, value in given
+                  if "field_of_view" in name and 0 < value < DOUBTFUL_DEG]  # fmt: skip
 
 
 def _refuse(message: str, conflicts: Sequence[str]) -> None:

@@ -18,6 +18,7 @@ import numpy as np
 from lidardesign.config import with_task_settings
 from lidardesign.constraints.check import ConstraintCheck
 from lidardesign.constraints.document import Constraints, load_constraints
+from lidardesign.constraints.feasibility import unit_notes
 from lidardesign.constraints.origins import is_mounted, origin_box, snap_to_space
 from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.estimates import Estimate, as_documents
@@ -129,7 +130,7 @@ class FitRequest:
             notes(f"--parts takes the place of parts.names: {', '.join(given)}")
         constraints, names = _with_rig(options, _with_survival(options, _with_parts(options, asked, run)), run, notes)
         rules, moved = snap_to_space(constraints or Constraints(), run.config.space)
-        for note in moved:
+        for note in (*moved, *unit_notes(asked or Constraints(), run.config.space)):
             notes(note)
         layout = _layout(rules, base, run, options)
         check_layout(layout, rules, run, options)

@@ -6,6 +6,7 @@ Booleans and quoted text are no numbers, and names hold no control characters.
 from __future__ import annotations
 
 import difflib
+import itertools
 import os
 import typing
 import unicodedata
@@ -240,6 +241,20 @@ def parse_override(text: str, option: str = "--set") -> Override:
         return Override(tuple(parts), resolve_scalar(value), where)
     except ValueError as error:
         raise ConfigError(str(error), where=where, allowed="a finite number") from None
+
+
+def parse_overrides(texts: Iterable[str], option: str = "--set") -> list[Override]:
+    """Read several `KEY=VALUE`; a key before which the section `task` is left out is the same.
+
+    Raises:
+        ConfigError: One cannot be read, or sets a key, or one inside of it, that another sets to something else.
+    """
+    overrides = [parse_override(text, option) for text in texts]
+    for one, other in itertools.combinations(overrides, 2):
+        keys = sorted(f"{'.'.join(map(str, each.path)).removeprefix('task.')}." for each in (one, other))
+        if keys[1].startswith(keys[0]) and one.value != other.value:
+            raise ConfigError(f"{keys[0][:-1]} is already set by {one.where}", where=other.where, hint="remove one")
+    return overrides
 
 
 def apply_override(values: dict[str, Any], override: Override) -> KeyPath:

@@ -36,6 +36,7 @@ MOST_ELEMENTS, MOST_COPIES = 20_000, 2000
 MOST_PIXELS, MOST_PLACES = 1 << 27, 1 << 21
 MOST_NUMBERS = 10_000
 REPEATING = ("replicate", "composite", "flexcomp")
+FARTHEST_RANGE = 1e18  # of a joint [m or rad]: some models have 1e16 for no limit
 PNG_BEGINNING = b"\x89PNG\r\n\x1a\n"
 MESH_ENDINGS = (".obj", ".stl", ".msh")  # mesh formats of MuJoCo
 # Groups that MuJoCo's viewer shows by default; Menagerie has visual geoms in group 2, collision geoms in group 3.
@@ -152,26 +153,28 @@ def load_model(
     _check_places(model, path)
     if root.find("mujoco/compiler[@discardvisual='true']") is not None:
         collected.append("visual shapes are discarded, so rays meet the collision shapes")
+    upside_down = [model.joint(number).name for number, (low, high) in enumerate(model.jnt_range) if low > high]
+    collected += [f"the range of joint {name!r} ends below its start, so it has no limits" for name in upside_down]
     lines = dict.fromkeys(" ".join(str(line).split()) for line in (*collected, *(one.message for one in caught)))
     return model, tuple(f"{path.name}: MuJoCo warns: {line}" for line in lines)
 
 
 def _check_places(model: mujoco.MjModel, path: Path) -> None:
-    """Refuse poses and sizes that are not finite or too large, and height fields that are too large.
+    """Refuse poses, sizes and ranges that are not finite or too large, and height fields that are too large.
 
     Raises:
         DataError: Such a value, with its body, geom or joint.
     """
-    kinds = {"body": ("body_pos", "body_quat"), "geom": ("geom_pos", "geom_quat", "geom_size"), "jnt": ("jnt_pos",)}
-    for kind, names in kinds.items():
-        for name in names:
-            rows = getattr(model, name)
-            wrong = ~(np.abs(rows) <= FARTHEST_M).all(axis=1)
-            if wrong.any():
-                number = int(np.argmax(wrong))
-                called = (model.joint if kind == "jnt" else getattr(model, kind))(number).name
-                found = f"{name} of {called or f'{kind} {number}'!r} is {' '.join(map(str, rows[number].tolist()))}"
-                raise DataError(found, where=str(path), allowed=f"numbers up to {FARTHEST_M:g}")
+    names = ("body_pos", "body_quat", "geom_pos", "geom_quat", "geom_size", "jnt_pos", "jnt_range")
+    for name in names:
+        rows, kind = getattr(model, name), name.partition("_")[0]
+        most = FARTHEST_RANGE if name == "jnt_range" else FARTHEST_M
+        wrong = ~(np.abs(rows) <= most).all(axis=1)
+        if wrong.any():
+            number = int(np.argmax(wrong))
+            called = (model.joint if kind == "jnt" else getattr(model, kind))(number).name
+            found = f"{name} of {called or f'{kind} {number}'!r} is {' '.join(map(str, rows[number].tolist()))}"
+            raise DataError(found, where=str(path), allowed=f"numbers up to {most:g}")
     places = int((model.hfield_nrow * model.hfield_ncol).sum())
     if places > MOST_PLACES:
         raise DataError(f"has {places} places of height fields", where=str(path), allowed=f"at most {MOST_PLACES}")

@@ -22,12 +22,13 @@ from lidardesign.scenes.mesh_files import check_mesh, usable_faces
 from lidardesign.scenes.rays import Returns
 from lidardesign.scenes.scene import Body, Mesh, Receiver, Scene, Sign
 from lidardesign.space import DesignSpace
-from lidardesign.task import Defaults, Information, Interval, Metres, Metric, Score, Split, Vector, random_generator
+from lidardesign.task import Defaults, Information, Interval, Metric, Score, Split, random_generator
 from lidardesign_tasks.basel import MorphableModel, Unit, load_model
 from lidardesign_tasks.importance import WEIGHING_KEYS, Importance, middle_of_origins
 from lidardesign_tasks.poses import jittered_pose
 from lidardesign_tasks.surface import surface_informs, surface_score, with_visible_truth
 from lidardesign_tasks.surroundings import any_direction
+from lidardesign_tasks.view import OriginBox
 
 # columns: the world's x, y, z are the model's z (out of the face), x (to the head's left) and y (up)
 WORLD_AXES = [2, 0, 1]
@@ -56,7 +57,7 @@ class FaceConfig(HeadConfig):
     """Heads, and bounds of the sensor in front of them."""
 
     distance_m: float = Field(0.40, ge=0.1, le=5, description="from the mean nose tip to the sensor [m]")
-    origin_box_m: Metres | Vector = Field(0.0, description="half size of the box of sensor origins [m]; 0: fixed")
+    origin_box_m: OriginBox = Field(0.0, description="half size of the box of sensor origins [m]; 0: fixed")
     half_angle_deg: float = Field(30.0, gt=0, le=80, description="azimuth and elevation span +- this [deg]")
     range_m: Interval = Field((0.05, 1.05), description="shortest and longest range [m]")
 
@@ -74,7 +75,7 @@ class FaceTask:
 
     def space(self, config: FaceConfig) -> DesignSpace:
         """Origins in a box around (distance, 0, 0), directions around -x."""
-        half = np.broadcast_to(np.abs(np.asarray(config.origin_box_m, dtype=np.float64)), 3)
+        half = np.broadcast_to(np.asarray(config.origin_box_m, dtype=np.float64), 3)
         angle, centre = math.radians(config.half_angle_deg), np.array([config.distance_m, 0.0, 0.0])
         return DesignSpace(
             low=(*(centre - half).tolist(), math.pi - angle, -angle, config.range_m[0]),

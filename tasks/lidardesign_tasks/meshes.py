@@ -25,7 +25,7 @@ from lidardesign.scenes.mesh_files import COLOURS, SUFFIXES, Y_UP, Painted, list
 from lidardesign.scenes.rays import Returns
 from lidardesign.scenes.scene import Body, Mesh, Scene, Sign
 from lidardesign.space import FARTHEST_M, DesignSpace
-from lidardesign.task import Defaults, FolderConfig, Information, Metres, Metric, Score, Split, Vector, random_generator
+from lidardesign.task import Defaults, FolderConfig, Information, Metric, Score, Split, Vector, random_generator
 from lidardesign_tasks.importance import WEIGHING_KEYS, Importance, middle_of_origins
 from lidardesign_tasks.motion import Motion, load_motion, moved_bounds_m
 from lidardesign_tasks.moving_surface import SURFACES, moving_informs, moving_score, with_moving_truth
@@ -40,7 +40,7 @@ from lidardesign_tasks.surface import (
 )
 from lidardesign_tasks.surroundings import any_direction
 from lidardesign_tasks.units import doubtful_meshes, doubtful_motion
-from lidardesign_tasks.view import space_around, space_around_box
+from lidardesign_tasks.view import OriginBox, space_around, space_around_box
 
 Axis = Literal["format", "x", "y", "z"]
 # the file's axes that become the world's x, y, z: a rotation of the up axis to z
@@ -85,7 +85,7 @@ class MeshesConfig(FolderConfig, Importance):
     )
     occluders: Path | None = Field(None, description="folder of meshes that block the view, in world coordinates")
     origin_m: Vector | None = Field(None, description="place of the sensor [m]; if empty: in front, 2 extents away")
-    origin_box_m: Metres | Vector = Field(0.0, description="half size of the box of sensor origins [m]; 0: fixed")
+    origin_box_m: OriginBox = Field(0.0, description="half size of the box of sensor origins [m]; 0: fixed")
     truth_points: int = Field(
         5000, ge=100, le=200_000, description="points of the visible surface that scores compare with"
     )
@@ -102,6 +102,12 @@ class MeshesConfig(FolderConfig, Importance):
     colour_contrast: float = Field(
         10.0, gt=1e-3, le=1e3, description="how many times as much white counts as black, with importance=colours"
     )
+
+    def held_out(self, files: Sequence[Path]) -> Sequence[Path]:
+        """A share of the meshes, the same for all seeds; none of a single one."""
+        files = [file for file in files if file.parent == self.folder]
+        order = random_generator(SPLIT_SEED, "meshes", "split").permutation(len(files))
+        return [files[i] for i in order[: min(max(round(self.test_share * len(files)), 1), len(files) - 1)]]
 
     @model_validator(mode="after")
     def _contrast_of_colours(self) -> MeshesConfig:
@@ -363,10 +369,8 @@ def split_meshes(meshes: Sequence[tuple[str, Mesh]], config: MeshesConfig, split
     names = list(config.learned_files(list_mesh_files(config.folder)))
     if len(names) == 1:
         return list(meshes)
-    order = random_generator(SPLIT_SEED, "meshes", "split").permutation(len(names))
-    held_out = min(max(round(config.test_share * len(names)), 1), len(names) - 1)
-    chosen = {names[i] for i in (order[:held_out] if split == "test" else order[held_out:])}
-    kept = [(name, mesh) for name, mesh in meshes if name in chosen]
+    held_out = {path.name for path in config.held_out([config.folder / name for name in names])}
+    kept = [(name, mesh) for name, mesh in meshes if (name in held_out) == (split == "test")]
     if not kept:
         which, hint = "held-out" if split == "test" else "training", "put them back, or learn again"
         raise DataError(f"holds none of the {which} meshes of the run", where=str(config.folder), hint=hint)
@@ -395,7 +399,7 @@ def derived_space(config: MeshesConfig, named: Sequence[tuple[str, Mesh]], motio
 
     For a pile it is the box around it instead of the sphere.
     """
-    half = np.broadcast_to(np.abs(np.asarray(config.origin_box_m, dtype=np.float64)), 3)
+    half = np.broadcast_to(np.asarray(config.origin_box_m, dtype=np.float64), 3)
     background = pile_of(config, named)
     if background is not None:
         bounds_m, up = background.bounds_m, math.radians(ABOVE_DEG)

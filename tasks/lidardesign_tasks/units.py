@@ -11,7 +11,7 @@ from lidardesign.space import RANGE, DesignSpace
 # Larger objects are probably in another unit, and so are longer paths, in extents of the moving object.
 DOUBTFUL_EXTENT_M, DOUBTFUL_WAY = 20.0, 50.0
 # Robots are recorded many times per second; short recordings, which may be handwritten, are not judged.
-DOUBTFUL_STEP_S, FEW_MOMENTS = 1.0, 10
+DOUBTFUL_STEP_S, DOUBTFUL_PAUSE_S, FEW_MOMENTS = 1.0, 3600.0, 10
 
 
 def doubtful_meshes(extents_m: Mapping[str, float], scale: float) -> list[str]:
@@ -59,19 +59,22 @@ def doubtful_motion(bounds_m: Mapping[str, np.ndarray], extent_m: float, space: 
 
 
 def doubtful_times(time_s: Mapping[str, np.ndarray]) -> list[str]:
-    """A note on recordings whose time steps are so long that times may be in another unit.
+    """A note on recordings with time steps, usual ones or one, so long that times may be in another unit.
 
     Arguments:
         time_s: Ascending times of each recording, by its name [s].
     """
-    steps_s = {name: float(np.median(np.diff(times))) for name, times in time_s.items() if len(times) > FEW_MOMENTS}
-    name = max(steps_s, key=lambda name: steps_s[name], default=None)
-    if name is None or steps_s[name] < DOUBTFUL_STEP_S:
-        return []
-    return [
-        f"{name}: its rows are {steps_s[name]:.4g} s apart; times are in seconds: are they milliseconds or less? "
-        "Motion is uniform in between"
-    ]
+    steps_s = {name: np.diff(times) for name, times in time_s.items() if len(times) > FEW_MOMENTS}
+    usual_s = {f"{name}: its rows": float(np.median(steps)) for name, steps in steps_s.items()}
+    longest_s = {f"{name}: two of its rows": float(steps.max()) for name, steps in steps_s.items()}
+    for found, doubtful_s in ((usual_s, DOUBTFUL_STEP_S), (longest_s, DOUBTFUL_PAUSE_S)):
+        rows = max(found, key=lambda rows: found[rows], default=None)
+        if rows is not None and found[rows] >= doubtful_s:
+            return [
+                f"{rows} are {found[rows]:.4g} s apart; times are in seconds: are they milliseconds or less? "
+                "Motion is uniform in between"
+            ]
+    return []
 
 
 def _gap_m(bounds_m: np.ndarray, space: DesignSpace) -> float:

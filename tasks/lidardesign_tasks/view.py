@@ -4,11 +4,24 @@ from __future__ import annotations
 
 import itertools
 import math
+from typing import Annotated
 
 import numpy as np
+from pydantic import AfterValidator
 
 from lidardesign.numerics import circular_difference
 from lidardesign.space import DesignSpace, aim
+from lidardesign.task import Metres, Vector
+
+
+def _half_size(value: float | Vector) -> float | Vector:
+    if np.min(value) < 0:
+        raise ValueError("half sizes are 0 m or more")
+    return value
+
+
+# Half size of a box of sensor origins [m]: of all its sides, or along x, y and z.
+OriginBox = Annotated[Metres | Vector, AfterValidator(_half_size)]
 
 
 def space_around(centre: np.ndarray, radius: float, origin: np.ndarray, half: np.ndarray) -> DesignSpace:

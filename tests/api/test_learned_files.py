@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from lidardesign_tasks.meshes import MeshesConfig
 from lidardesign_tasks.robot.recordings import read_recordings
 from lidardesign_tasks.robot.task import MujocoConfig
 from support.command_line import caller
@@ -115,7 +116,7 @@ def test_what_went_or_changed_moves_no_other_mesh(place):
         split: [name for name in scenes if name != gone] for split, scenes in before.items()
     }
     said = " ".join(run.input_notes())
-    assert all(words in said for words in (gone if gone < changed else changed, "and 1 more changed since", "z.stl"))
+    assert all(words in said for words in (f"{changed} changed", f"{gone} is gone", "z.stl"))
 
 
 @pytest.mark.parametrize(("kept", "words"), [("test", "training"), ("train", "held-out"), (None, "none of the files")])
@@ -180,3 +181,18 @@ def test_recordings_stay_on_their_side_too(tmp_path):
     (folder / "b.csv").unlink()
     with pytest.raises(DataError, match="is gone"):
         read_recordings(model, folder, config)
+
+
+@pytest.mark.parametrize(("kind", "suffix"), [("folder", "stl"), ("motion", "csv")])
+def test_equal_files_in_both_halves_are_named(tmp_path, kind, suffix):
+    config = MeshesConfig if kind == "folder" else MujocoConfig
+    files = [tmp_path / f"{letter}.{suffix}" for letter in "abcd"]
+    held, other = ([one for one in files if (one in config(**{kind: tmp_path}).held_out(files)) == is_held]
+                   for is_held in (True, False))  # fmt: skip
+
+    def notes(*equal):
+        inputs = {str(file): "same" if file in equal else file.name for file in files}
+        return config(**{kind: tmp_path}, inputs=inputs).twin_notes()
+
+    assert notes() == notes(*held) == notes(*other) == []
+    assert f": {held[0].name} and {other[0].name}" in notes(held[0], other[0])[0]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import pytest
 from lidardesign_tasks.flatland import FlatlandTask
 from support.conditioned_runs import make_conditioned_run
@@ -53,3 +55,23 @@ def test_scenes_that_are_none_are_the_tasks_fault():
     task.scenes = lambda config, split, seed: [{"bodies": []}]
     with pytest.raises(PluginError, match=r"scenes\(\) returned a dict"):
         scenes_of(task, None, "train", 0, DesignSpace((0.0,) * 6, (1.0,) * 6))
+
+
+def fork():
+    if child := os.fork():
+        os.waitpid(child, 0)
+
+
+@pytest.mark.parametrize(
+    ("does", "code"), [(lambda: os._exit(0), 6), (lambda: os.chdir("/"), 0), (lambda: os.umask(0o777), 0), (fork, 0)]
+)
+def test_scoring_neither_ends_nor_moves_nor_multiplies_the_program(lidardesign, run, monkeypatch, tmp_path, does, code):
+    scores = FlatlandTask.score
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(FlatlandTask, "score", lambda *given: (does(), scores(*given))[1])
+    result = lidardesign("evaluate", run, "--rays", 3, "--baseline", "none", "--csv", "scores.csv")
+    with open("ends", "a") as ends:
+        ends.write(f"{os.getpid()}\n")
+    assert (tmp_path / "ends").read_text() == f"{os.getpid()}\n"
+    assert result.code == code, result.err
+    assert [path.stat().st_mode & 0o600 for path in tmp_path.glob("*.csv")] == [0o600] * (code == 0)

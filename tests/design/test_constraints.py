@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+import re
 
 import pytest
 from pydantic import ValidationError
 from support.constraints import CONTRADICTIONS, FACE
 
-from lidardesign.constraints.document import Constraints, DistanceRange, Gate, rules_of
-from lidardesign.constraints.feasibility import check_feasible
+from lidardesign.constraints.document import Constraints, DistanceRange, Gate, load_constraints, rules_of
+from lidardesign.constraints.feasibility import check_feasible, unit_notes
 from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.sensors.sensor import MOST_RAYS
 from lidardesign.space import DesignSpace
@@ -206,3 +207,28 @@ def test_only_parts_are_rolled_beyond_an_eighth_of_a_turn(roll):
     with pytest.raises(InfeasibleError, match="exchanged"):
         check_feasible(Constraints.from_mapping(rules), FACE)
     check_feasible(Constraints.from_mapping({**rules, "parts": {"count": 1}}), FACE, sensors=1)
+
+
+NEAR = DesignSpace((0.4, 0.0, 0.0, 2.6, -0.5, 0.05), (0.4, 0.0, 0.0, 3.7, 0.5, 1.05))
+
+
+@pytest.mark.parametrize(
+    ("override", "question"),
+    [
+        ("gate.end_m.max=500", "gate.end_m.max=500 .* design space: in millimetres"),
+        ("gate.width_m.max=100", "millimetres"),
+        ("origin.low_m=[-1000, -1, -1]", "origin.low_m.0=-1000 .*millimetres"),
+        ("each=[{gate: {end_m: {max: 500}}}]", "each.0.gate.end_m.max=500"),
+        ("field_of_view.vertical_deg.max=0.35", "field_of_view.vertical_deg.max=0.35 .*radians"),
+        ("gate.end_m.max=5", None),
+        ("field_of_view={}", None),
+        ("field_of_view.vertical_deg={min: 0, max: 35}", None),
+        ("origin.exclude=[{low_m: [-1000, -1000, 1], high_m: [1000, 1000, 1000]}]", None),
+        ("budget.bandwidth_mbps=1000", None),
+        ("parts.names=catalog", None),
+    ],
+)
+def test_bounds_that_are_probably_in_another_unit_are_questioned(override, question):
+    notes = unit_notes(load_constraints(None, [override]), NEAR)
+    assert len(notes) == (question is not None)
+    assert all(re.search(question, note) for note in notes)

@@ -31,7 +31,8 @@ def test_processes_score_as_this_one_does_and_end():
 
 
 def test_a_worker_that_dies_ends_the_evaluation_with_what_to_do(install):
-    task = install(f"import os\n{BROKEN}".replace('raise RuntimeError("the map of test 1 is lost")', "os._exit(7)"))
+    dies = "os.kill(os.getpid(), 9)"
+    task = install(f"import os\n{BROKEN}".replace('raise RuntimeError("the map of test 1 is lost")', dies))
     request = make_request(task=task)
     with pytest.raises(NumericalError, match="died") as raised, opened_workers(2, task, 6) as starmap:
         evaluate(replace(request, starmap=starmap))

@@ -248,6 +248,7 @@ BROKEN = {
     "raises_no_exception": ("class Odd(BaseException): pass\nraise Odd('odd')", "Odd: odd"),
     "leaves": ("raise SystemExit(3)", "exit 3"),
     "is_of_another_version": (GOOD.replace("api_version = 1", "api_version = 99"), "version 99"),
+    "exits_hard": ("import os\nos._exit(7)", "tried to end the program (exit 7)"),
     "raises_when_asked": (GOOD.replace("metric = Metric", "metric = property(lambda self: 1 / 0)\n    was = Metric"),
                           "ZeroDivisionError"),
 }  # fmt: skip
@@ -260,7 +261,6 @@ FATAL = {
     "hangs_in_c": ("import ctypes\nctypes.PyDLL(None).pause()", "was not imported within 0.3 s"),
     "locks": ("import threading\nlock = threading.Lock()\nlock.acquire()\nlock.acquire()",
               "was not imported within 0.3 s"),
-    "exits_hard": ("import os\nos._exit(7)", "ends the program while it is imported (exit code 7)"),
     "crashes": ("import ctypes\nctypes.string_at(0)", "crashes while it is imported (Segmentation fault)"),
     "aborts": ("import os\nos.abort()", "crashes while it is imported (Aborted)"),
     "writes_anywhere": ("import os\nfor number in range(3, 64):\n    try: os.write(number, b'hello\\n')\n"

@@ -22,6 +22,7 @@ from lidardesign.contract import contract_of
 from lidardesign.contract.contract import LAWS
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.rays.information import require_valid
+from lidardesign.registry import load_task
 from lidardesign.run.manifest import note, start_manifest
 from lidardesign.run_folder import RunFolder, input_hashes
 from lidardesign.scenes.casting import SceneCaster
@@ -221,6 +222,20 @@ def test_times_in_another_unit_than_seconds_are_told(folder, configured, step_s,
     assert all("walk.csv" in note and f"{step_s:.4g} s apart" in note for note in told)
 
 
+def test_one_long_pause_among_short_steps_is_told(folder, configured):
+    moments = {"time_s": np.arange(30) / 10 + 1e6 * (np.arange(30) > 20)}
+    config = configured(motion=write_csv(folder / "walk.csv", table(np.linspace(-1, 1, 30), **moments)), frames=4)
+    told = " ".join(TASK.notes(config, TASK.space(config)))
+    assert "walk.csv: two of its rows are 1e+06 s apart" in told
+
+
+@pytest.mark.parametrize("task", ["meshes", "mujoco", "face"])
+@pytest.mark.parametrize("half", [-1, [0.1, -0.1, 0]])
+def test_a_box_of_origins_has_no_negative_size(task, half):
+    with pytest.raises(ConfigError, match="half sizes are 0 m or more"):
+        resolve(load_task(task), overrides=[f"origin_box_m={half}"])
+
+
 def test_a_folder_of_the_model_that_is_none_is_called_so(configured, tmp_path):
     with pytest.raises(DataError, match="is not a folder"):
         TASK.space(configured(folder=tmp_path / "absent"))
@@ -237,7 +252,7 @@ def test_a_run_tells_that_what_its_task_reads_has_changed(folder, tmp_path):
     (folder / "robot.xml").write_text(ROBOT.replace(" ", "  ", 1))
     assert "robot.xml changed since" in RunFolder.open(run).input_notes()[0]
     (folder / "robot.xml").unlink()
-    assert "robot.xml changed since" in RunFolder.open(run).input_notes()[0]
+    assert "robot.xml is gone since" in RunFolder.open(run).input_notes()[0]
 
 
 def test_keyframes_are_passed_at_rest(folder):

@@ -84,7 +84,7 @@ BROKEN = {
         (VALUE, "        return Score(1.0, details={'seen': 'much'})\n", "the details {'seen': 'much'}"),
     ],
     "no returns are scored": [
-        ("Score(self.metric.worst, failed=True)", "Score(-5.0)", "no rays score -5, better than"),
+        ("Score(self.metric.worst, failed=True)", "Score(-5.0)", "score returned -5"),
     ],
     "best on the truth": [
         (METRIC, METRIC.replace("lower", "higher").replace("100.0", "0.0"), "does not reward seeing the targets"),

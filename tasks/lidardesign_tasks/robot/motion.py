@@ -76,6 +76,11 @@ def keyframes(model: mujoco.MjModel, where: str) -> Recording:
     return Recording("keyframes", np.arange(len(qpos)) / FINEST_HZ, qpos)
 
 
+def held_out(count: int) -> np.ndarray:
+    """Indices of the held-out ones of several recordings, the same for all seeds."""
+    return random_generator(SPLIT_SEED, "mujoco", "split").permutation(count)[: count // 2]
+
+
 def spans(recordings: Sequence[Recording], split: Split) -> list[tuple[Recording, float, float]]:
     """Recordings of a split with the first and last time of their part in it [s].
 
@@ -85,9 +90,9 @@ def spans(recordings: Sequence[Recording], split: Split) -> list[tuple[Recording
         (one,) = recordings
         first, middle, last = one.time_s[0], one.time_s[0] + one.seconds / 2, one.time_s[-1]
         return [(one, first, middle) if split == "train" else (one, middle, last)]
-    order = random_generator(SPLIT_SEED, "mujoco", "split").permutation(len(recordings))
-    chosen = np.sort(order[: len(order) // 2] if split == "test" else order[len(order) // 2 :])
-    return [(recordings[i], recordings[i].time_s[0], recordings[i].time_s[-1]) for i in chosen]
+    held = held_out(len(recordings))
+    chosen = [one for i, one in enumerate(recordings) if (i in held) == (split == "test")]
+    return [(one, one.time_s[0], one.time_s[-1]) for one in chosen]
 
 
 def window_frames(recordings: Sequence[Recording], frames: int, rate_hz: float) -> int:

@@ -24,7 +24,6 @@ from lidardesign.task import (
     FolderConfig,
     Information,
     Interval,
-    Metres,
     Metric,
     Score,
     Split,
@@ -34,6 +33,7 @@ from lidardesign.task import (
 from lidardesign_tasks.robot.measures import METRICS, TOLERATED_SHARE, Measure, features, informs, score, with_truth
 from lidardesign_tasks.robot.motion import (
     Trajectory,
+    held_out,
     keyframes,
     wandering,
     window_frames,
@@ -44,7 +44,7 @@ from lidardesign_tasks.robot.targets import Model, read_model, refuse_sensors_in
 from lidardesign_tasks.surface import MILLIMETRES
 from lidardesign_tasks.surroundings import MovingSurroundings
 from lidardesign_tasks.units import doubtful_times
-from lidardesign_tasks.view import space_around
+from lidardesign_tasks.view import OriginBox, space_around
 
 # names may be given alone or as a list
 # MuJoCo shows geoms in six groups.
@@ -80,7 +80,7 @@ class MujocoConfig(FolderConfig, MovingSurroundings):
         None,
         description="place of the sensor in the mount's frame [m]; if empty: in front, 2 extents away, or on the mount",
     )
-    origin_box_m: Metres | Vector = Field(0.0, description="half size of the box of sensor origins [m]; 0: fixed")
+    origin_box_m: OriginBox = Field(0.0, description="half size of the box of sensor origins [m]; 0: fixed")
     range_m: Interval | None = Field(None, description="shortest and longest range [m]; from the targets if empty")
     metric: Measure = Field(
         "position",
@@ -90,6 +90,10 @@ class MujocoConfig(FolderConfig, MovingSurroundings):
     frame_rate_hz: float = Field(10.0, gt=0, le=10_000, description="frames per second [Hz]")
     train: int = Field(40, ge=1, le=10_000, description="training scenes")
     test: int = Field(40, ge=1, le=10_000, description="held-out scenes")
+
+    def held_out(self, files: Sequence[Path]) -> Sequence[Path]:
+        """Half of several recordings."""
+        return [files[i] for i in held_out(len(files))]
 
 
 class MujocoTask:
@@ -112,7 +116,7 @@ class MujocoTask:
         if config.mount_body is not None:
             usual = model.mount_top_m() + np.array([0.0, 0.0, ABOVE_MOUNT_M])
         origin = usual if config.origin_m is None else np.array(config.origin_m)
-        half = np.broadcast_to(np.abs(np.asarray(config.origin_box_m, dtype=np.float64)), 3)
+        half = np.broadcast_to(np.asarray(config.origin_box_m, dtype=np.float64), 3)
         space = space_around((low + high) / 2, _radius_m(low, high), origin, half)
         if config.range_m is None:
             return space
