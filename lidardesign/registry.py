@@ -75,6 +75,7 @@ def _probe_of(child: Child, seconds: float) -> Probe | None:
 GROUP = "lidardesign.tasks"
 IMPORT_SECONDS = 30.0
 AUTHOR_HINT = "report it to its author"
+END_PROCESS = os._exit  # the one that ends it
 # Child processes at the same time.
 SIDE_BY_SIDE = 8
 
@@ -172,11 +173,11 @@ def plugin_guard(name: str) -> Iterator[None]:
 @contextlib.contextmanager
 def _unchanged_process() -> Iterator[None]:
     """Put folder and umask back; `os._exit` raises SystemExit, and a process that was forked meanwhile ends."""
-    process, end, mask = os.getpid(), os._exit, os.umask(0o077)
+    process, mask = os.getpid(), os.umask(0o077)
     os.umask(mask)
 
     def leave(status: int) -> NoReturn:
-        raise SystemExit(status if os.getpid() == process else end(status))
+        raise SystemExit(status if os.getpid() == process else END_PROCESS(status))
 
     os._exit = leave
     try:
@@ -184,8 +185,9 @@ def _unchanged_process() -> Iterator[None]:
             yield
     finally:
         if os.getpid() != process:
-            end(0)
-        os._exit = end
+            END_PROCESS(0)
+        # never what another thread has put there meanwhile
+        os._exit = END_PROCESS
         os.umask(mask)
 
 
