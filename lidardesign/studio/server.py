@@ -1,4 +1,4 @@
-"""The page's server: viser on this machine alone, behind a check of who connects.
+"""The page's server: viser on this machine alone, behind a check of who connects; and threads that work for it.
 
 viser accepts every connection. Here the address holds a random token, which every request and websocket has to name;
 what comes from a page of another origin, or under another host's name, is refused before viser sees it.
@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import http
 import secrets
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, redirect_stdout
 from dataclasses import dataclass, field, replace
 from http.client import HTTPConnection
 from io import StringIO
+from queue import SimpleQueue
 from typing import Any
 
 import viser
@@ -25,6 +27,7 @@ from lidardesign.errors import ConfigError
 HOST, HOSTS = "127.0.0.1", ("127.0.0.1", "localhost")
 OPTION = "--port"
 TOKEN_BYTES = 24
+END_S = 1.0  # for which what is under way is waited for
 
 
 class LocalServer(viser.ViserServer):
@@ -130,3 +133,42 @@ def _lets_strangers_in(guard: Guard) -> bool:
     with closing(connection):
         connection.request("GET", "/")
         return connection.getresponse().status != http.HTTPStatus.FORBIDDEN
+
+
+class Worker:
+    """A thread that does the last thing asked for under each name; what waits under the same name is dropped.
+
+    Arguments:
+        name: Of the thread.
+        failed: Called with what was raised.
+    """
+
+    def __init__(self, name: str, failed: Callable[[Exception], None]) -> None:
+        self._queue: SimpleQueue[Any] = SimpleQueue()
+        self._last: dict[Any, Callable[[], None]] = {}
+        self._failed = failed
+        self._thread = threading.Thread(target=self._work, name=name, daemon=True)
+        self._thread.start()
+
+    def ask(self, name: Any, work: Callable[[], None]) -> None:
+        """Have something done after what was asked for under other names."""
+        self._last[name] = work
+        self._queue.put((name, work))
+
+    def drop(self) -> None:
+        """Forget what waits."""
+        self._last.clear()
+
+    def stop(self) -> None:
+        """End the thread after what it does now, which is not waited for long."""
+        self.drop()
+        self._queue.put(None)
+        self._thread.join(END_S)
+
+    def _work(self) -> None:
+        for name, work in iter(self._queue.get, None):
+            if self._last.get(name) is work:
+                try:
+                    work()
+                except Exception as error:
+                    self._failed(error)

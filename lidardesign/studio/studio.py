@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -36,7 +35,7 @@ from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.space import observed_point
 from lidardesign.studio.choices import EVERY, MOUNT, Choices, SensorPose
 from lidardesign.studio.panel import BLIND, DENSITY, LAYERS, LIGHTS, NONE, SPLITS, STEPS, ControlPanel
-from lidardesign.studio.server import start_server, stop_server
+from lidardesign.studio.server import Worker, start_server, stop_server
 from lidardesign.studio.stage import BESIDE, COLOURS, Stage
 from lidardesign.task import random_generator
 
@@ -52,50 +51,10 @@ MOST_UNDONE = 100
 ABOUT_BASELINES = "Baselines fire as many rays, each wherever it likes: no part or limit holds for them."
 NAME = "studio"  # of designs that are not saved yet
 CONSTRAINTS = "constraints"  # the folder of constraint files in a run
-END_S = 1.0  # for which what is under way is waited for
 
 
 class StoppedError(Exception):
     """A user stopped what was under way."""
-
-
-class Worker:
-    """A thread that does the last thing asked for under each name; what waits under the same name is dropped.
-
-    Arguments:
-        name: Of the thread.
-        failed: Called with what was raised.
-    """
-
-    def __init__(self, name: str, failed: Callable[[Exception], None]) -> None:
-        self._queue: SimpleQueue[Any] = SimpleQueue()
-        self._last: dict[Any, Callable[[], None]] = {}
-        self._failed = failed
-        self._thread = threading.Thread(target=self._work, name=name, daemon=True)
-        self._thread.start()
-
-    def ask(self, name: Any, work: Callable[[], None]) -> None:
-        """Have something done after what was asked for under other names."""
-        self._last[name] = work
-        self._queue.put((name, work))
-
-    def drop(self) -> None:
-        """Forget what waits."""
-        self._last.clear()
-
-    def stop(self) -> None:
-        """End the thread after what it does now, which is not waited for long."""
-        self.drop()
-        self._queue.put(None)
-        self._thread.join(END_S)
-
-    def _work(self) -> None:
-        for name, work in iter(self._queue.get, None):
-            if self._last.get(name) is work:
-                try:
-                    work()
-                except Exception as error:
-                    self._failed(error)
 
 
 class Studio:
