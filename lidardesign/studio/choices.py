@@ -97,7 +97,7 @@ class Choices:
     @property
     def headline(self) -> str:
         """What the design is, in a line."""
-        state = "changed: press Fit" if self.state == "changed" else f"as {self.state}"
+        state = "changed since the fit" if self.state == "changed" else f"as {self.state}"
         sensors = f"{len(self.sensors)} sensor{'s' * (len(self.sensors) != 1)}"
         return f"{self.design.name} ({state}): {sensors}, {self.design.usual_count(ignore)} rays"
 

@@ -206,7 +206,8 @@ class ControlPanel:
     def show_pose(self, choices: Choices, name: str, pose: SensorPose | None) -> None:
         """Show the numbers of what has the handle."""
         is_sensor = pose is not None and not name.startswith(MOUNT)
-        self.place.disabled, self.angles.disabled, self.free.disabled = pose is None, not is_sensor, not is_sensor
+        self.place.disabled, self.angles.disabled = pose is None, not is_sensor
+        self.free.disabled = not is_sensor or not choices.fixed(name)
         if pose is None:
             text = "Choose a sensor, or click its ball in the view; in training scenes it can be moved."
             self._where.content = _box("2.6em", text)

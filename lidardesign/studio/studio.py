@@ -124,8 +124,7 @@ class Studio:
         self._page.ask(key, partial(self._do, key, value))
 
     def _do(self, key: tuple[str, str], value: Any) -> None:
-        if key[0] != "step":
-            self._panel.say("")
+        self._panel.say("")
         changed = getattr(self, f"_on_{key[0]}")(value)
         if changed is None:
             self._show_controls()
@@ -424,6 +423,7 @@ class Studio:
         self._panel.add_design(name)
         self._panel.say_saved(f"saved {design.path} and {folder / CONSTRAINTS / name}.yaml")
         self._change(replace(choices, design=design, base=design, state="saved"))
+        self._reference = design
 
     def _on_mounts(self, _: Any) -> None:
         page = self._exported("mounts") / "mounts.html"

@@ -125,7 +125,7 @@ def test_a_user_narrows_a_field_of_a_robots_sensors_fits_scores_and_saves(robot,
         tab.field("horizontal max [deg]").fill("2")
         tab.field("horizontal max [deg]").press("Enter")
         wait_for(lambda: studio.choices.value("field_of_view.horizontal_deg.max") == "2")
-        tab.page.get_by_text("changed: press Fit").wait_for()
+        tab.page.get_by_text("changed since the fit").wait_for()
         tab.press("Fit")
         tab.page.get_by_text("as fitted").wait_for(timeout=60_000)
         assert all(math.degrees(sensor.field_of_view_rad[0]) <= 2 for sensor in studio.choices.sensors)
