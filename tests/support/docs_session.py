@@ -30,7 +30,7 @@ QUICK = (
 SMALL = {
     "flatland": (*QUICK, "learning.steps=80", "density.sigma_m=0.06"),
     "face": (*QUICK, "learning.steps=80", "density.sigma_m=0.04", "truth_points=500"),
-    "arm": (*QUICK, "learning.steps=100", "learning.samples=10000", "density.sigma_m=0.2", "frames=8"),
+    "arm": ("learning.samples=10000", *QUICK[1:], "learning.steps=100", "density.sigma_m=0.2", "frames=8"),
     "warehouse": (*QUICK, "learning.steps=120", "density.sigma_m=0.2"),
     "mujoco": (*QUICK, "learning.steps=100", "density.sigma_m=0.1", "frames=4"),
     "meshes": (*QUICK[:-2], "learning.steps=100", "density.sigma_m=0.01", "poses=1", "truth_points=500"),
