@@ -75,7 +75,7 @@ def _probe_of(child: Child, seconds: float) -> Probe | None:
 GROUP = "lidardesign.tasks"
 IMPORT_SECONDS = 30.0
 AUTHOR_HINT = "report it to its author"
-END_PROCESS = os._exit  # the one that ends it
+END_PROCESS, HERE = os._exit, getattr(os, "O_PATH", os.O_RDONLY)
 # Child processes at the same time.
 SIDE_BY_SIDE = 8
 
@@ -173,7 +173,8 @@ def plugin_guard(name: str) -> Iterator[None]:
 @contextlib.contextmanager
 def _unchanged_process() -> Iterator[None]:
     """Put folder and umask back; `os._exit` raises SystemExit, and a process that was forked meanwhile ends."""
-    process, mask = os.getpid(), os.umask(0o077)
+    # by its number a folder is found again even where it has gone
+    process, mask, folder = os.getpid(), os.umask(0o077), os.open(".", HERE)
     os.umask(mask)
 
     def leave(status: int) -> NoReturn:
@@ -181,14 +182,15 @@ def _unchanged_process() -> Iterator[None]:
 
     os._exit = leave
     try:
-        with contextlib.chdir("."):
-            yield
+        yield
     finally:
         if os.getpid() != process:
             END_PROCESS(0)
         # never what another thread has put there meanwhile
         os._exit = END_PROCESS
         os.umask(mask)
+        os.fchdir(folder)
+        os.close(folder)
 
 
 @contextlib.contextmanager

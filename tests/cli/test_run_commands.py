@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import typer
-from support.command_line import files_under, make_run
+from support.command_line import files_under, make_run, set_options
 from support.plugins import GOOD, install_plugins
 
 from lidardesign.cli.main import app
@@ -18,7 +18,8 @@ from lidardesign.run.files import run_lock
 from lidardesign.run.manifest import note, read_manifest, verify
 
 TINY = ("steps=2", "batch=64", "samples=1000", "balance_proposals=256", "coverage_proposals=256", "hidden=4")
-LEARN_TINY = [word for value in ("train=1", *(f"learning.{one}" for one in TINY)) for word in ("--set", value)]
+SET_TINY = ("train=1", *(f"learning.{one}" for one in TINY))
+LEARN_TINY = set_options(SET_TINY)
 
 
 @pytest.fixture
@@ -70,7 +71,7 @@ def test_hints_can_be_pasted_whatever_a_folder_is_called(lidardesign, flat):
 
 
 def learned(lidardesign, *arguments):
-    return lidardesign("learn", "flatland", *LEARN_TINY, "--out", "run", *arguments)
+    return lidardesign("learn", "flatland", *set_options(SET_TINY, arguments), "--out", "run", *arguments)
 
 
 @pytest.fixture

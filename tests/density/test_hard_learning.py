@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from support.command_line import set_options
 from support.learning import interrupt_after_a_checkpoint
 
 from lidardesign.density.training import quality
@@ -16,8 +17,8 @@ RESULTS = ("flow.safetensors", "samples.npz")
 
 
 def learn(lidardesign, out, *further):
-    options = [word for setting in SETTINGS for word in ("--set", setting)]
-    return lidardesign("learn", "arm", "--preset", "draft", "--out", out, *options, *further, "--json")
+    words = (*set_options(SETTINGS, further), *further, "--json")
+    return lidardesign("learn", "arm", "--preset", "draft", "--out", out, *words)
 
 
 @pytest.mark.hard_case("P1")

@@ -41,6 +41,12 @@ def caller(capsys, tmp_path, monkeypatch):
     return call
 
 
+def set_options(settings, further=()):
+    """`--set` of each of some settings, without those that further words set otherwise."""
+    keys = {str(word).partition("=")[0] for word in further}
+    return [word for setting in settings if setting.partition("=")[0] not in keys for word in ("--set", setting)]
+
+
 def make_run(folder: Path, count: int = 4000, task: str = "flatland", seed: int = 3) -> Path:
     """A run as `learn` leaves it, with samples around two spots of its space instead of a learned density."""
     task = load_task(task)
