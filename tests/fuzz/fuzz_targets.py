@@ -50,7 +50,7 @@ def open_overrides(_: Path) -> Read:
         return resolve(load_task("flatland"), overrides=[text])
 
     def constrained(text: str) -> object:
-        return load_constraints(None, ["gate.width_m.max=0.1", text])
+        return load_constraints(None, ["budget.rays=3", text])
 
     def run(content: bytes) -> object:
         text = content.decode("utf-8", errors="replace")
