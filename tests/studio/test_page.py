@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.browsers import opened_browser
 from support.mesh_runs import make_mesh_run
-from support.studios import make_robot_run, wait_for
+from support.studios import PATIENCE_S, make_robot_run, wait_for
 
 pytest.importorskip("viser", reason="viser is not installed (extra: studio)")
 
@@ -46,6 +46,7 @@ class Tab:
     def __init__(self, browser, studio):
         known = {*studio._server.get_clients()}
         self.page, self.errors = browser.new_page(viewport={"width": 1440, "height": 900}), []
+        self.page.set_default_timeout(1000 * PATIENCE_S)
         self.page.on("console", lambda line: self.errors.append(line.text) if line.type == "error" else None)
         self.page.goto(studio.address)
         self.page.get_by_text("kept for comparing").wait_for()
@@ -127,7 +128,7 @@ def test_a_user_narrows_a_field_of_a_robots_sensors_fits_scores_and_saves(robot,
         wait_for(lambda: studio.choices.value("field_of_view.horizontal_deg.max") == "2")
         tab.page.get_by_text("changed since the fit").wait_for()
         tab.press("Fit")
-        tab.page.get_by_text("as fitted").wait_for(timeout=60_000)
+        tab.page.get_by_text("as fitted").wait_for()
         assert all(math.degrees(sensor.field_of_view_rad[0]) <= 2 for sensor in studio.choices.sensors)
         tab.open("Save")
         tab.press("Save the design and its constraints")
@@ -136,6 +137,6 @@ def test_a_user_narrows_a_field_of_a_robots_sensors_fits_scores_and_saves(robot,
         tab.page.get_by_text("wrote").wait_for()
         tab.open("Scores")
         tab.press("Score")
-        tab.page.get_by_text("held-out scenes, which").wait_for(timeout=60_000)
+        tab.page.get_by_text("held-out scenes, which").wait_for()
         tab.page.locator(".js-plotly-plot").wait_for()
         assert not tab.errors
