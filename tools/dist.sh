@@ -2,14 +2,12 @@
 # Builds sdist and wheel into dist/, installs the wheel with every Python from 3.11 to 3.13 that is found, each in an empty
 # environment under build/, and runs the demo with it.
 set -euo pipefail
+. "$(dirname "$0")/pythons.sh"
 rm -rf dist
 "$1" -m build --no-isolation --outdir dist . > /dev/null
 ls dist
 for version in 3.11 3.12 3.13; do
-    found=("${PYENV_ROOT:-$HOME/.pyenv}"/versions/"$version".*/bin/python)
-    python="${found[-1]}"
-    [ -x "$python" ] || python="$(command -v "python$version" || true)"
-    [ -n "$python" ] || { echo "Python $version is not here"; continue; }
+    python="$(found_python "$version")" || continue
     place="build/dist-$version"
     echo "Python $version: installing the wheel, running the demo"
     rm -rf "$place"

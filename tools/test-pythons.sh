@@ -2,15 +2,13 @@
 # Installs the project with every Python from 3.11 to 3.13 that is found, but for the one given, and runs the core's
 # tests. Each has a folder of its own under build/.
 set -euo pipefail
+. "$(dirname "$0")/pythons.sh"
 own="$("$1" -c 'import sys; print("%d.%d" % sys.version_info[:2])')"
 core=(tests/test_numerics.py tests/test_space.py tests/test_config.py tests/test_meshio.py tests/density/test_quality.py
     tests/density/test_splines.py tests/simulate/test_plan.py tests/selection tests/api/test_api.py)
 for version in 3.11 3.12 3.13; do
     [ "$version" = "$own" ] && continue
-    found=("${PYENV_ROOT:-$HOME/.pyenv}"/versions/"$version".*/bin/python)
-    python="${found[-1]}"
-    [ -x "$python" ] || python="$(command -v "python$version" || true)"
-    [ -n "$python" ] || { echo "Python $version is not here"; continue; }
+    python="$(found_python "$version")" || continue
     place="build/python$version"
     echo "Python $version: installing"
     "$python" -m venv "$place"

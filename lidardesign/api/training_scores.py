@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 PURPOSE = "comparison"  # of the stream of training scenes: fits choose and hold back scenes of other streams
 SCENES = 20
+MOST_KEPT = 100  # designs whose scores are known
 
 
 class TrainingScores:
@@ -45,7 +46,7 @@ class TrainingScores:
         scenes: int = SCENES,
     ) -> None:
         self.run, self.detector, self.settings, self.count = run, detector, settings_texts(settings), scenes
-        self._values: dict[int, tuple[Design, np.ndarray]] = {}
+        self.values = lru_cache(MOST_KEPT)(self._values)
 
     @cached_property
     def scenes(self) -> list[Scene]:
@@ -56,16 +57,12 @@ class TrainingScores:
         stream = TrainingScenes(run, run.config.seed).scenes(PURPOSE)
         return list(itertools.islice(stream, self.count))
 
-    def values(self, design: Design) -> np.ndarray:
+    def _values(self, design: Design) -> np.ndarray:
         """The score in each scene."""
         from lidardesign.scoring.scene_scores import checked_score
 
-        # the design is kept beside its values, so that its number is no other's
-        if id(design) not in self._values:
-            seen = design.simulate(self.scenes, detector=self.detector, settings=self.settings)
-            found = [checked_score(self.run.task, self.run.metric, one.scene, one.returns).value for one in seen]
-            self._values[id(design)] = design, np.array(found)
-        return self._values[id(design)][1]
+        seen = design.simulate(self.scenes, detector=self.detector, settings=self.settings)
+        return np.array([checked_score(self.run.task, self.run.metric, one.scene, one.returns).value for one in seen])
 
     def score(self, design: Design) -> Interval:
         """The mean score with its interval."""

@@ -109,12 +109,17 @@ def check_feasible(
 def unit_notes(constraints: Constraints, space: DesignSpace) -> list[str]:
     """Questions about bounds that are probably in millimetres or radians: far beyond the space, or below a degree."""
     most_m = DOUBTFUL_TIMES * max(map(abs, (*space.low[:3], *space.high[:3], space.high[RANGE])))
-    given = [(".".join(map(str, path)), value) for path, value in leaves(constraints.as_document())
-             if isinstance(value, int | float) and "exclude" not in path]  # fmt: skip
-    far = [f"{name}={value:g} is far beyond the design space: in millimetres?" for name, value in given
-           if "_m." in f"{name}." and abs(value) > most_m]  # fmt: skip
-    return far + [f"{name}={value:g} is a very small angle: in radians?" for name, value in given
-                  if "field_of_view" in name and 0 < value < DOUBTFUL_DEG]  # fmt: skip
+    given = {
+        ".".join(map(str, path)): value
+        for path, value in leaves(constraints.as_document())
+        if isinstance(value, int | float) and "exclude" not in path
+    }
+    far = {name: value for name, value in given.items() if "_m." in f"{name}." and abs(value) > most_m}
+    narrow = {name: value for name, value in given.items() if "field_of_view" in name and 0 < value < DOUBTFUL_DEG}
+    return [
+        *(f"{name}={value:g} is far beyond the design space: in millimetres?" for name, value in far.items()),
+        *(f"{name}={value:g} is a very small angle: in radians?" for name, value in narrow.items()),
+    ]
 
 
 def _refuse(message: str, conflicts: Sequence[str]) -> None:

@@ -89,8 +89,9 @@ class Choices:
 
     @classmethod
     def of(cls, run: Run, design: Design, shown: Choices | None = None) -> Choices:
-        """The choices with a design and its constraints, in the scene that is shown; a saved one is fitted again."""
-        base = None if design.path is None else design
+        """The choices with a design and its constraints, in the scene that is shown; one of the run is fitted again."""
+        is_own = design.path is not None and design.path.resolve() == run.design_path(design.name).resolve()
+        base = design if is_own else None
         constraints = Constraints.from_mapping(design.specification.constraints).as_document()
         return replace(shown or cls(run, design, {}), design=design, constraints=constraints, base=base, state="saved")
 
@@ -112,6 +113,11 @@ class Choices:
     def sensors(self) -> tuple[Sensor, ...]:
         """The sensors of the design."""
         return self.design.specification.sensors
+
+    @property
+    def names(self) -> list[str]:
+        """The names of the sensors."""
+        return [sensor.name for sensor in self.sensors]
 
     @property
     def mounts_m(self) -> list[list[float]]:
@@ -168,9 +174,10 @@ class Choices:
         document: dict[str, Any] = deepcopy(dict(self.constraints))
         is_own = scope != EVERY and key.split(".")[0] in SensorConstraints.model_fields
         target = _entry(document, self._number(scope)) if is_own else document
-        _set(target, key.split("."), parse_override(f"{key}={text}").value if text.strip() else None)
-        if key == self.count_key and text.strip():
-            document["each"] = document.get("each", [])[: int(text)]
+        value = parse_override(f"{key}={text}").value if text.strip() else None
+        _set(target, key.split("."), value)
+        if key == self.count_key and isinstance(value, int):
+            document["each"] = document.get("each", [])[:value]
         return self._with(document)
 
     def made_of(self, part: str | None) -> Choices:
@@ -232,7 +239,7 @@ class Choices:
     def tight(self, scope: str = EVERY) -> set[str]:
         """The keys whose bounds limit the design, or one sensor of it, without what is fixed by hand."""
         checks = () if self.design.result is None else self.design.result.constraints
-        owned = [(*split_name(check.name, [*self.poses]), check) for check in checks if room_of(check).is_tight]
+        owned = [(*split_name(check.name, self.names), check) for check in checks if room_of(check).is_tight]
         return {
             key
             for owner, key, _ in owned
@@ -240,7 +247,7 @@ class Choices:
         }
 
     def _number(self, name: str) -> int:
-        return [sensor.name for sensor in self.sensors].index(name)
+        return self.names.index(name)
 
     def _with(self, document: dict[str, Any]) -> Choices:
         """The choices with a constraint file, checked."""

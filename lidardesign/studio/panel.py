@@ -100,12 +100,14 @@ class ControlPanel:
         async def _(event: Any) -> None:
             if event.client is None:
                 return
-            self._typed[id(control)] = turn = object()
-            await asyncio.sleep(TYPED_S if waits else 0.0)
-            if self._typed.get(id(control)) is turn:
+            if waits:
+                self._typed[id(control)] = turn = object()
+                await asyncio.sleep(TYPED_S)
+                if self._typed.get(id(control)) is not turn:
+                    return
                 del self._typed[id(control)]
-                value = getattr(event.target, "value", None)
-                self._wish(wish, value if key is None else (key, value))
+            value = getattr(event.target, "value", None)
+            self._wish(wish, value if key is None else (key, value))
 
         return control
 
@@ -183,9 +185,9 @@ class ControlPanel:
             scope: Whose limits are shown.
             counts: The number of scenes of the split, and of frames of the scene.
         """
-        names, (sensors, rays) = [sensor.name for sensor in choices.sensors], choices.counts
+        sensors, rays = choices.counts
         self._offer(self.handle, [NONE, *choices.poses], handle)
-        self._offer(self.scope, [EVERY, *names], scope)
+        self._offer(self.scope, [EVERY, *choices.names], scope)
         for slider, value, most in (
             (self.scene, choices.scene, counts[0] - 1),
             (self.frame, choices.frame, counts[1] - 1),
@@ -215,7 +217,9 @@ class ControlPanel:
         words = {"origin": "place", "boresight": "direction"}
         fixed = " and ".join(words[key] for key in choices.fixed(name)) if is_sensor else "place"
         kept = f"fixed: {fixed}" if fixed else "the next fit may place it elsewhere"
-        self._where.content = _box("2.6em", f"<b>{name}</b> in {choices.design.specification.frame}; {kept}")
+        self._where.content = _box(
+            "2.6em", f"<b>{escape(name)}</b> in {escape(choices.design.specification.frame)}; {kept}"
+        )
         self._give(self.place, ", ".join(map(str, pose.place_m)))
         self._give(self.angles, ", ".join(map(str, pose.angles_deg)))
 

@@ -155,13 +155,9 @@ class Worker:
         self._last[name] = work
         self._queue.put((name, work))
 
-    def drop(self) -> None:
-        """Forget what waits."""
-        self._last.clear()
-
     def stop(self) -> None:
         """End the thread after what it does now, which is not waited for long."""
-        self.drop()
+        self._last.clear()
         self._queue.put(None)
         self._thread.join(END_S)
 

@@ -84,7 +84,7 @@ class Studio:
         self._page, self._answers = (Worker(f"studio {name}", self._failed) for name in ("page", "answers"))
         design = self.choices.design
         self._stage = Stage(self._server, design.specification, partial(self.wish, "handle"), self._drag)
-        names = [*self.saved] or [design.name]
+        names = [*dict.fromkeys([*self.saved, design.name])]
         self._panel = ControlPanel(self._server, self.choices, names, FIXED_BASELINES, load_library().names, self.wish)
         self._refresh()
 
@@ -121,7 +121,8 @@ class Studio:
     def wish(self, name: str, value: Any = None) -> None:
         """Do what a user asks for on the page: the name of a wish, and its value."""
         key = (name, value[0]) if isinstance(value, tuple) else (name, "")
-        self._page.ask(key, partial(self._do, key, value))
+        # every press of a button counts
+        self._page.ask(object() if name == "step" else key, partial(self._do, key, value))
 
     def _do(self, key: tuple[str, str], value: Any) -> None:
         self._panel.say("")
@@ -184,6 +185,8 @@ class Studio:
         self._panel.outcomes.content = f"{len(one.rays)} rays: {', '.join(words)}"
 
     def _show_controls(self) -> None:
+        # a fit may leave fewer sensors
+        self._scope = self._scope if self._scope in self.choices.names else EVERY
         counts = len(self._scenes_of(self.choices)), self._frames
         self._panel.show(self.choices, self._handle, self._scope, counts)
         self._panel.show_pose(self.choices, self._handle, self._pose())
@@ -263,7 +266,7 @@ class Studio:
             self._stage.show_density(observed_point(points))
 
     def _on_scope(self, value: Any) -> None:
-        self._scope = value if value in self.choices.poses else EVERY
+        self._scope = value if value in self.choices.names else EVERY
 
     def _on_limit(self, value: Any) -> Choices:
         return self.choices.constrained(value[0], str(value[1]), self._scope)
@@ -278,7 +281,7 @@ class Studio:
         known = value in self._panel.detector.options
         return replace(self.choices, detector=value, state="changed") if known else None
 
-    def _on_light(self, value: Any) -> Choices | None:
+    def _on_light(self, value: Any) -> Choices:
         lit = replace(self.choices, settings=LIGHTS.get(value, ()), state="changed")
         self._scenes_of(lit)  # refused where the task has no light
         return lit
@@ -291,7 +294,7 @@ class Studio:
             partial(self._travel, self._before, self._after),
             partial(self._travel, self._after, self._before),
             partial(self._answers.ask, "fit", partial(self._find_fit, self.choices)),
-            self._stop_answers,
+            self._stops.set,
             partial(self._answers.ask, "evaluate", partial(self._evaluate, self.choices)),
         )
         if value in STEPS:
@@ -302,10 +305,6 @@ class Studio:
             goal.append(self.choices)
             self._reference, self.choices = self.choices.design, source.pop()
             self._refresh()
-
-    def _stop_answers(self) -> None:
-        self._answers.drop()
-        self._stops.set()
 
     # Answers, which are found beside the page and shown where they are still asked for.
 
@@ -452,7 +451,8 @@ class Studio:
         self._panel.say(f"{title}: {body}", is_wrong=True)
         for client in self._server.get_clients().values():
             client.add_notification(title, body, color="red")
-        self._show_controls()
+        with suppress(Exception):  # what failed may be this
+            self._show_controls()
 
 
 def _figure(interval: Interval, unit: str, word: str = "") -> str:

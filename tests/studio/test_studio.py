@@ -131,6 +131,11 @@ def test_undo_goes_back_to_every_record_and_redo_forth(studio):
     for state in states[1:]:
         studio.wish("step", "Redo")
         wait_for(lambda state=state: studio.choices is state)
+    # presses in a row all count
+    for step in ("Undo", "Undo", "Redo"):
+        studio.wish("step", step)
+    wait_for(lambda: len(studio._after) == 1)
+    assert studio.choices is states[-2]
 
 
 HOSTILE = {
@@ -141,6 +146,7 @@ HOSTILE = {
     "not a number": [("limit", ("gate.width_m.max", ".nan"))],
     "a limit of another kind": [("limit", ("gate.width_m.max", "[1, 2"))],
     "an unknown key": [("limit", ("gate.widht_m.max", "1"))],
+    "half a sensor": [("limit", ("sensors.count", "1.5"))],
     "a path of a part": [("limit", ("parts.names", '["/etc/x.yaml"]'))],
     "a module that is none": [("limit", ("parts", "{names: [module-wide], count: 2}")), ("step", "Fit")],
     "a wish that there is not": [("no such wish", 1)],
@@ -188,6 +194,23 @@ def test_held_out_scenes_are_looked_at_and_nothing_is_moved_by_them(studio):
     studio.wish("look", ("frame", 1))
     wait_for(lambda: studio.choices.frame == 1)
     assert studio.choices.design is design
+
+
+def test_the_limits_of_a_sensor_that_a_fit_leaves_out_are_not_shown_any_more(studio, robot):
+    studio.wish("scope", "s1")
+    wait_for(lambda: studio._scope == "s1")
+    studio.choices = replace(studio.choices, design=robot.fit(sensors=1, rays=16, name="one"))
+    studio.wish("limit", ("budget.rays", "11"))
+    wait_for(lambda: studio._scope == "all sensors" and studio.choices.value("budget.rays") == "11")
+    assert "bug" not in studio._panel._working.content
+
+
+def test_a_design_of_elsewhere_is_shown_and_the_run_is_fitted_to(robot, tmp_path):
+    design = robot.fit(sensors=1, rays=16, name="elsewhere")
+    design.save(tmp_path / "elsewhere.yaml")
+    with Studio(robot, design) as studio:
+        assert studio.choices.base is None
+        assert studio.choices.command("x").startswith(f"lidardesign constrain {robot.folder} ")
 
 
 def test_a_thousand_wishes_come_to_the_last_one(studio):
