@@ -6,6 +6,7 @@ Exit codes (design contract): 0 ok, 1 threshold missed, 2 usage or config, 3 bad
 
 from __future__ import annotations
 
+import errno
 import functools
 import re
 import site
@@ -30,6 +31,8 @@ ARGUMENTS = {
 }
 # The largest seed.
 MAX_SEED = 2**63 - 1
+# Words of libraries that have no memory left.
+NO_MEMORY = ("allocate memory", "failed to map segment", "bad_alloc")
 # Hint for an option or a key without a value.
 UNSET_HINT = "a shell variable that is not set expands to nothing: give a value, or leave it out"
 # Folders of the documentation: of a checkout, or of an installation (pyproject.toml, data-files).
@@ -180,6 +183,16 @@ class ThresholdError(LidardesignError):
     """A threshold that the user set was missed (exit 1)."""
 
     exit_code, kind = 1, "threshold"
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """True for errors that say so by their class, number or text, as those of torch and of compiled libraries do."""
+    return (
+        isinstance(error, MemoryError)
+        or type(error).__name__ == "OutOfMemoryError"
+        or getattr(error, "errno", None) == errno.ENOMEM
+        or any(words in str(error).lower() for words in NO_MEMORY)
+    )
 
 
 def check_number(value: float, where: str, low: float, high: float, *, whole: bool = False) -> None:

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from importlib.metadata import EntryPoint, distributions, entry_points
 from typing import Any, NoReturn
 
-from lidardesign.errors import ConfigError, DataError, LidardesignError, PluginError
+from lidardesign.errors import ConfigError, DataError, LidardesignError, PluginError, is_out_of_memory
 from lidardesign.run.child import START_SECONDS, Child, ChildError
 from lidardesign.run.clock import phase
 from lidardesign.task import API_VERSION, Defaults, Metric, Task, TaskConfig
@@ -160,6 +160,8 @@ def plugin_guard(name: str) -> Iterator[None]:
     except SystemExit as error:
         raise PluginError(f"tried to end the program (exit {error.code})", where=f"task {name}") from error
     except BaseException as error:
+        if is_out_of_memory(error):
+            raise MemoryError from error
         if isinstance(error, OSError) and error.filename is not None:
             reason, hint = error.strerror or type(error).__name__, f"the task {name} reads it: check the path"
             raise DataError(f"cannot be read: {reason}", where=str(error.filename), hint=hint) from error

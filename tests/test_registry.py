@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 import time
@@ -84,6 +85,9 @@ def test_the_guard_turns_what_a_plugin_raises_into_a_plugin_error():
         raise ConfigError("mine")
     with pytest.raises(KeyboardInterrupt), plugin_guard("good"):
         raise KeyboardInterrupt
+    for lost in (MemoryError(), OSError(errno.ENOMEM, "no"), ImportError("lib.so: failed to map segment from object")):
+        with pytest.raises(MemoryError), plugin_guard("good"):
+            raise lost
     message = r"(?s)cannot be read: File name too long.*the task good reads it"
     with pytest.raises(DataError, match=message), plugin_guard("good"):
         os.stat("x" * 300)

@@ -362,7 +362,7 @@ class Design(DesignSource):
 
 @phase("designs")
 def collect_designs(
-    targets: Sequence[Design | Path], judge: RunFolder | None = None, notes: Notes = log_note
+    targets: Sequence[Design | Path], judge: RunFolder | None = None, notes: Notes = log_note, names: Sequence[str] = ()
 ) -> list[Design]:
     """The designs that were named: of run folders all designs, of files the file; each once.
 
@@ -370,6 +370,7 @@ def collect_designs(
         targets: Designs, design files and run folders.
         judge: The run in whose scenes they are scored, where one was named.
         notes: Called with every note.
+        names: The designs that are wanted; where a run has all of them, its others are not read.
 
     Raises:
         DataError: One is not there, or there are none.
@@ -384,7 +385,9 @@ def collect_designs(
             designs.append(target)
         elif target in opened:
             run = opened[target]
-            designs += [Design(read_design(path, notes), run, path) for path in run.design_paths()]
+            wanted = [path for path in run.design_paths() if path.stem in names]
+            found = wanted if wanted and len(wanted) == len(set(names)) else run.design_paths()
+            designs += [Design(read_design(path, notes), run, path) for path in found]
         elif not target.exists():
             raise DataError("no such run or design", where=str(target), hint="give run folders or design files")
         else:

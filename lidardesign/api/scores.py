@@ -187,7 +187,7 @@ class ScoreRequest:
             DataError: A design or a run is not there, or damaged.
         """
         planner, audit = options.planner()
-        designs = select_by_name(collect_designs(targets, judge, notes), options.designs)
+        designs = select_by_name(collect_designs(targets, judge, notes, options.designs), options.designs)
         run = learned = scoring_run(name_apart(designs), judge, notes)
         for note in learned.input_notes():
             notes(note)

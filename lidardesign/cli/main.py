@@ -129,8 +129,8 @@ app = typer.Typer(
     name=PROGRAM,
     help="Design LiDARs: learn which rays are worth firing, fit sensors, prove what they are worth.",
     epilog="Exit codes: 0 ok, 1 threshold missed, 2 usage or config, 3 bad input data, "
-    "4 infeasible constraints, 5 numerical failure, 6 plugin failure, 70 internal error, 130 interrupted, "
-    "141 output closed, 143 terminated.",
+    "4 infeasible constraints, 5 numerical failure or no memory left, 6 plugin failure, 70 internal error, "
+    "130 interrupted, 141 output closed, 143 terminated.",
     context_settings=SETTINGS,
     no_args_is_help=True,
     pretty_exceptions_enable=False,

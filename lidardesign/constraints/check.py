@@ -88,7 +88,8 @@ def check_design(document: Mapping[str, Any], constraints: Any, space: Any = Non
             checks += _inside_space(name, sensor, bounds)
     for pattern in patterns:
         checks += _pattern(pattern, own_rules, bounds)
-        if document.get("layout") == "chosen":
+        # others fire what their part or file says, whose field may be round
+        if document.get("layout") in ("chosen", "spinning"):
             checks += _astray(pattern, sensors, level)
     checks += _mounts(sensors, own_rules) + _parts(document, rules.get("parts"))
     return checks + _budget(document, rules.get("budget") or {})
@@ -290,7 +291,7 @@ def _pattern(
 
 
 def _astray(pattern: Mapping[str, Any], sensors: Sequence[Mapping[str, Any]], level: float) -> list[ConstraintCheck]:
-    """Failed checks of chosen rays inside their sensor's place or region, field of view and gate, at any knot."""
+    """Failed checks of listed rays inside their sensor's place or region, field of view and gate, at any knot."""
     owner, failed = np.asarray(pattern["sensor"]), []
     for index, sensor in enumerate(sensors):
         own, view, gate = np.flatnonzero(owner == index), sensor["field_of_view_rad"], sensor["gate_m"]
@@ -302,7 +303,11 @@ def _astray(pattern: Mapping[str, Any], sensors: Sequence[Mapping[str, Any]], le
         sideways = np.hypot(*across)
         # true angles from the boresight, along the field's two axes
         angle = np.arctan2(sideways, forward) / np.where(sideways > 0, sideways, 1.0)
-        most = [float(np.abs(angle * part).max(initial=0.0)) * 2 for part in across]
+        parted = [angle * part for part in across]
+        if view["horizontal"] > math.pi:
+            # behind the boresight only turns and heights say where rays are
+            parted = [np.arctan2(across[0], forward), np.arcsin(np.clip(across[1], -1.0, 1.0))]
+        most = [float(np.abs(part).max(initial=0.0)) * 2 for part in parted]
         name = str(sensor.get("name", index))
         checks = [
             ConstraintCheck(f"{name}.rays.{axis}_rad", view[axis], value, value <= view[axis] + AGREEMENT)

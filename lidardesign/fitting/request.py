@@ -340,7 +340,7 @@ def _with_parts(options: FitOptions, asked: Constraints | None, run: RunFolder) 
         "parts with --gates: a part's gates are fixed": options.gates,
         f"the task {run.task.name} has no method informs": not informs_rays(run.task),
     }
-    allowed = "--parts NAME,NAME --sensors N, or parts.names, parts.count"
+    allowed = "--parts NAME,NAME --sensors N, or parts.names, parts.count; without --layout or --gates"
     refuse_first({(fault, "--parts", allowed): is_found for fault, is_found in lacking.items()})
     return asked
 

@@ -139,7 +139,7 @@ def named_parts(names: Sequence[str] | str, bounded: Iterable[str] = ()) -> list
                 f"{name!r} is not one of the parts",
                 where="parts.each",
                 allowed=", ".join(known),
-                hint=suggest(name, known),
+                hint=suggest(name, known) or "files of parts of your own go into parts.names",
             )
     return parts
 

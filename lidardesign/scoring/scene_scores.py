@@ -152,11 +152,20 @@ def checked_score(task: Task, metric: Metric, scene: Scene, returns: Sequence[Re
     A value beyond the worst one counts as the worst, so that failing is never better.
 
     Raises:
-        PluginError: The task's score raised, or returned something that is no finite score, or better than the best.
+        PluginError: The task's score raised, changed the truth, or returned something that is no finite score, or
+            better than the best.
     """
     where = f"task {task.name}, metric {metric.name}, scene {scene.name}"
+    truth = dict(scene.truth)
+    for value in truth.values():
+        if isinstance(value, np.ndarray):
+            value.setflags(write=False)
     with plugin_method(task.name, "scoring", where):
         score = task.score(scene, returns)
+    if len(truth) != len(scene.truth) or any(scene.truth.get(name) is not value for name, value in truth.items()):
+        raise PluginError(
+            "score changed scene.truth", where=where, hint="the next design is scored by it: copy it first"
+        )
     if not isinstance(score, Score):
         raise PluginError(f"score returned {type(score).__name__}", where=where, allowed="lidardesign.task.Score")
     items = score.details.items() if isinstance(score.details, Mapping) else [(None, None)]

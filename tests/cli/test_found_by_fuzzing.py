@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import struct
@@ -229,6 +230,7 @@ def test_memory_that_torch_does_not_get_is_no_fault_of_the_program():
 
     with pytest.raises(RuntimeError) as refused:
         torch.empty(1 << 60, dtype=torch.uint8)
-    document, _, text = describe_error(refused.value, Output())
-    assert document["kind"] == "memory"
-    assert "fault" not in text
+    for lost in (refused.value, MemoryError(), OSError(errno.ENOMEM, "Cannot allocate memory")):
+        document, code, text = describe_error(lost, Output())
+        assert (document["kind"], code) == ("memory", 5)
+        assert "fault" not in text

@@ -161,6 +161,7 @@ def test_a_chosen_ray_that_looks_out_of_its_sensors_field_is_caught(document, se
     found = broken(bad)
     assert found
     assert set(found) <= {f"s{sensor}.rays.horizontal_rad", f"s{sensor}.rays.vertical_rad"}
+    assert broken({**bad, "layout": "spinning"})
     # rays of real parts and rigs are what they are
     assert broken({**bad, "layout": "fixed"}) == []
 

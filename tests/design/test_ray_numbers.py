@@ -119,6 +119,7 @@ def test_patterns_of_several_sizes_are_ranked_with_all_their_rays(call, run, tmp
     folder = shutil.copytree(run, tmp_path / "run")
     save_design(pattern("some", 5), folder / "designs" / "some.yaml")
     save_design(pattern("scanner", 3000), folder / "designs" / "scanner.yaml")
+    (folder / "designs" / "torn.yaml").write_text("sensors: [")  # of those that nobody asks for
     names = ("few", "some", "scanner")
     report = tmp_path / "report.html"
     told = call("evaluate", folder, *[word for name in names for word in ("--designs", name)], "--report", report)

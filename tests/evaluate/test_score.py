@@ -252,6 +252,20 @@ def test_a_broken_score_is_a_plugin_error_naming_task_metric_and_scene(result):
         assert word in str(caught.value)
 
 
+@pytest.mark.parametrize("change", [{}, {"points": None}, {"more": 1}])
+def test_a_score_that_changes_the_truth_of_a_scene_is_refused(change):
+    class Careless(MissTask):
+        def score(self, scene, returns):
+            scene.truth.update(change)
+            if not change:
+                scene.truth["points"][:] = 0
+            return Score(1.0)
+
+    test = [replace(scene, truth={"points": np.ones(3)}) for scene in scenes(2)]
+    with pytest.raises(PluginError, match=r"scene\.truth" if change else "read-only"):
+        evaluate(make_request(task=Careless(), test=test))
+
+
 def test_details_are_means_over_the_scenes_that_give_them():
     class Detailed(MissTask):
         def score(self, scene, returns):

@@ -24,7 +24,14 @@ import typer
 
 from lidardesign.cli.terminal.grids import ProgressDisplay, duration
 from lidardesign.cli.terminal.score_tables import show_times
-from lidardesign.errors import BackgroundNote, ConfigError, DataError, LidardesignError
+from lidardesign.errors import (
+    BackgroundNote,
+    ConfigError,
+    DataError,
+    LidardesignError,
+    NumericalError,
+    is_out_of_memory,
+)
 from lidardesign.run.clock import Clock, keep_timings, peak_memory_bytes, running
 from lidardesign.run.files import write_atomic
 from lidardesign.run.outputs import check_outputs
@@ -42,7 +49,6 @@ PLAIN_WIDTH = 120
 # Where this is set in the environment, errors show their tracebacks.
 DEBUG = "LIDARDESIGN_DEBUG"
 NUMBA_CACHE = "numba/core/caching.py"
-NO_MEMORY = "can't allocate memory"
 DISK_FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
 STDOUT, STDERR = 1, 2
 # Commands that only read a run wait for its writer no longer than this.
@@ -299,10 +305,9 @@ def describe_error(error: BaseException, output: Output) -> tuple[dict[str, Any]
         cause = cause.__cause__
     if isinstance(error, LidardesignError):
         return error.as_dict(), error.exit_code, f"{error.kind} error: {error}"
-    # torch says so by a name or by words of its own
-    if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError" or NO_MEMORY in str(error):
+    if is_out_of_memory(error):
         text = "the computer ran out of memory; a smaller batch, field_resolution or preset needs less"
-        return {"kind": "memory", "message": text}, EXIT_INTERNAL, f"memory error: {text}"
+        return {"kind": "memory", "message": text}, NumericalError.exit_code, f"memory error: {text}"
     if isinstance(error, OSError):
         name = f"{error.filename}: " if error.filename else ""
         document = {"kind": "system", "message": f"{name}{error.strerror or error}"}
