@@ -16,7 +16,6 @@ import torch
 from support.docs_session import in_process
 from support.meshes import BOX_FACES, BOX_VERTICES
 from support.small_runs import shifting_environment
-from support.tables import each_row
 
 from lidardesign.scenes.scene import Mesh
 
@@ -71,7 +70,7 @@ def run_here(monkeypatch, capsys, common):
     torch.set_rng_state(state)
 
 
-@each_row("script", SCRIPTS, ids=lambda path: path.stem)
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
 def test_a_benchmark_imports_and_explains_itself(script, run_here, capsys):
     if script.stem == "em":
         pytest.importorskip("sklearn")
