@@ -205,6 +205,7 @@ ROUGH = settings("train=3", "density.sigma_m=0.04")
 # Every benchmark at its smallest that runs for a minute at most, and how many tables it prints.
 SMALLEST = [
     ("arm", ["--preset", "draft", *SMALL_ARM, "--sensors", "2", "--rays", "40"]),
+    ("commands", ROUGH),
     ("constrain", [*FACE, *ROUGH, "--only", "none"]),
     ("fields", [*FACE, "--scenes", "2", "--resolution", "24", "--trimesh-points", "50"]),
     ("flow", ["--batch", "64", "--layers", "2", "--bins", "4", "--hidden", "8"]),
