@@ -128,16 +128,16 @@ def measure(scene: Scene, frame: int, rays: Rays, caster: SceneCaster, physics: 
     from lidardesign.simulate.detection import detect
 
     light = followed_light(scene, frame, rays, caster, physics)
-    found = detect(scene, frame, rays, light.windows_m, light.echoes, light.background, physics)
+    path_m, body = detect(scene, frame, rays, light.windows_m, light.echoes, light.background, physics)
     # rays without a return keep the outcome of their geometry, or were not detected
     first = np.full(len(rays), np.inf)
     np.minimum.at(first, light.beams.ray, light.hits.range_m)
     outcome = gate_outcomes(first, rays.gate_m)
     outcome[outcome == Outcome.RETURN] = Outcome.NOT_DETECTED
-    range_m = range_of_path(rays, scene.receiver, found.path_m)
+    range_m = range_of_path(rays, scene.receiver, path_m)
     detected = np.isfinite(range_m)
     outcome[detected] = Outcome.RETURN
-    return Returns(rays, outcome, range_m, np.where(detected, found.body, -1), frame=frame)
+    return Returns(rays, outcome, range_m, np.where(detected, body, -1), frame=frame)
 
 
 class FollowedLight(NamedTuple):

@@ -125,8 +125,7 @@ def _audit(
     progress: Progress | None,
 ) -> Audit:
     """The audit: the same entries under all effects, with the same random numbers."""
-    planner = replace(request.planner, choice="all")
-    scored = _score_all(request, entries, planner, progress, [planner.chosen_from(plan) for plan in plans])
+    scored = _score_all(request, entries, replace(request.planner, choice="all"), progress)
     paired = list(zip(effect_summaries(plans), effect_summaries(scored.plans), strict=True))
     metric = request.metric
     return Audit(

@@ -146,11 +146,6 @@ class Counts:
         return detector.photons.emitted(self.first_hits.sharing) * detector.light_of(self.first_hits.rays)
 
     @cached_property
-    def signal_per_pulse(self) -> np.ndarray:
-        """Counts of a return per pulse in clear air, 0 without one, shape (N,)."""
-        return np.where(self.first_hits.returned, self._of_first_hit, 0.0)
-
-    @cached_property
     def _of_first_hit(self) -> np.ndarray:
         photons = self.first_hits.detector.photons
         per_gain = self._emitted * photons.aperture_m2 * photons.efficiency
@@ -177,7 +172,7 @@ class Counts:
     @cached_property
     def signal(self) -> np.ndarray:
         """Counts of a return per frame in clear air, 0 without one, shape (N,)."""
-        return self.signal_per_pulse * self.pulses
+        return np.where(self.first_hits.returned, self._of_first_hit, 0.0) * self.pulses
 
     @property
     def typical(self) -> str:

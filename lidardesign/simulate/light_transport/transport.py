@@ -281,17 +281,13 @@ def render_transient(
     request |= {"bounces": bounces, "own": own_light}
     arrays |= (light_columns := _light_columns(lights, centre_m, reach_m))
     by_ray = columns | (light_columns if own_light else {})
+    # the answers of all requests, without the padding rays of the last
     parts = []
     for number, rows in enumerate(_chunks(count, bins.count)):
         mine = arrays | {name: values[rows] for name, values in by_ray.items()}
         own_seed = int(np.random.SeedSequence([seed, number]).generate_state(1)[0])
-        parts.append((rows[0], ask({**request, "seed": own_seed}, mine)))
-    return _joined(bins, count, parts)
-
-
-def _joined(bins: PathBins, count: int, answers: list[tuple[int, dict[str, np.ndarray]]]) -> Transients:
-    """Join the answers of all requests, by the first ray of each, without the padding rays of the last."""
-    parts = [{**found, "ray": found["ray"] + start} for start, found in answers]
+        found = ask({**request, "seed": own_seed}, mine)
+        parts.append({**found, "ray": found["ray"] + rows[0]})
     ray, cell, radiance, steady = (
         np.concatenate([part[name] for part in parts]) for name in ("ray", "cell", "radiance", "steady")
     )
