@@ -9,6 +9,7 @@ rays, cast once: rays exactly at vertices have probability 0 in a density.
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterator, Sequence
+from dataclasses import replace
 from typing import Literal
 from weakref import WeakKeyDictionary, WeakValueDictionary
 
@@ -276,11 +277,8 @@ class _AtRest:
     def trace(
         self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray, twice: SecondCasts | None
     ) -> Hits:
-        hits = Hits.none(len(origins))
-        if len(origins):
-            rows, range_m, geometry, normal = self.triangles.trace(origins, directions, limit_m, twice)
-            hits.range_m[rows], hits.body[rows], hits.normal[rows] = range_m, self.body_of_geometry[geometry], normal
-        return hits
+        hits = self.triangles.trace(origins, directions, limit_m, twice)
+        return replace(hits, body=np.append(self.body_of_geometry, -1)[hits.body])
 
 
 # Cached Embree scenes, by the first of their bodies and by geometry.
@@ -344,11 +342,11 @@ def _keep_nearer(
         asked = [part.passing(number, origins, directions, bound) for part, bound in zip(moving, bounds, strict=True)]
         rows, local, toward = zip(*asked, strict=True)
         bound = np.concatenate([bound[some] for bound, some in zip(bounds, rows, strict=True)])
-        range_m, normal = caster.first_hits(np.concatenate(local), np.concatenate(toward), bound, twice)
+        met = caster.trace(np.concatenate(local), np.concatenate(toward), bound, twice)
         ends = np.cumsum([len(some) for some in rows])
         for part, hits, some, end in zip(moving, found, rows, ends, strict=True):
             mine = slice(end - len(some), end)
-            part.enter(number, hits, some, range_m[mine], normal[mine])
+            part.enter(number, hits, some, met.range_m[mine], met.normal[mine])
 
 
 def _turned(vectors: np.ndarray, rotation: np.ndarray) -> np.ndarray:

@@ -52,7 +52,7 @@ def sample_triangles(
     if not len(faces):
         raise ValueError("a surface without faces has no points")
     corners = vertices[faces]
-    cumulated = np.cumsum(_doubled_areas(corners))
+    cumulated = np.cumsum(doubled_areas(corners))
     places = (np.arange(count) + generator.random(count)) / count * cumulated[-1]
     chosen = np.minimum(np.searchsorted(cumulated, places, side="right"), len(faces) - 1)
     root, share = np.sqrt(generator.random((count, 1))), generator.random((count, 1))
@@ -60,7 +60,8 @@ def sample_triangles(
     return (1 - root) * a + root * (1 - share) * b + root * share * c, chosen
 
 
-def _doubled_areas(corners: np.ndarray) -> np.ndarray:
+def doubled_areas(corners: np.ndarray) -> np.ndarray:
+    """Twice the areas of triangles by their corners, (N, 3, 3) to (N,) [m^2]."""
     return np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
 
 
@@ -95,7 +96,7 @@ def surface_area_m2(body: Body, space: DesignSpace) -> float:
         case Plane():
             return (2 * _reach_m(space)) ** 2
         case Mesh(vertices=vertices, faces=faces):
-            return float(_doubled_areas(vertices[faces]).sum() / 2)
+            return float(doubled_areas(vertices[faces]).sum() / 2)
 
 
 def target_area_m2(scene: Scene, space: DesignSpace) -> float:
