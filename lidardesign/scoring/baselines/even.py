@@ -16,7 +16,7 @@ from functools import cache, partial
 import numpy as np
 
 from lidardesign.numerics import TINY, unit_vectors
-from lidardesign.scoring.baselines.candidates import GatedLayout, LayoutSite, opened_gate
+from lidardesign.scoring.baselines.candidates import BaselineLayout, LayoutSite, opened_gate
 from lidardesign.scoring.baselines.views import RAY_AXES, Observed, ReturnTable, TrainingViews, dense_rays
 from lidardesign.sensors.bandwidth import split_budget
 from lidardesign.sensors.pattern import grid_rows, grid_tangent, low_discrepancy
@@ -269,7 +269,7 @@ def even_placement(low: np.ndarray, high: np.ndarray, count: int, field: SphereF
     return np.clip(points, low, high)
 
 
-def bounding(views: TrainingViews, *, gates_per_ray: bool = False) -> list[GatedLayout]:
+def bounding(views: TrainingViews, *, gates_per_ray: bool = False) -> list[BaselineLayout]:
     """The layouts of the baseline: what an engineer would build in five minutes from the training returns.
 
     One even layout, cropped to the central 99 % of the returns in direction and range. Where both angles are free, the
@@ -317,7 +317,7 @@ def crop_kinds(space: DesignSpace) -> dict[str, CropOf]:
     return {"parallel": _parallel_crop, "cropped": box_crop} if origins else {"cropped": box_crop}
 
 
-def _cropped(name: str, views: TrainingViews, crop_of: CropOf, gates_per_ray: bool) -> list[GatedLayout]:
+def _cropped(name: str, views: TrainingViews, crop_of: CropOf, gates_per_ray: bool) -> list[BaselineLayout]:
     """The layouts of a kind of crop; empty without returns."""
 
     @cache
@@ -337,8 +337,8 @@ def _cropped(name: str, views: TrainingViews, crop_of: CropOf, gates_per_ray: bo
         points = even_placement(low, high, count, crop.directions)
         return points, crop.table().gates(points, TAIL, 0.0) if per_ray else np.tile(crop.gate_m, (count, 1))
 
-    gated = [GatedLayout(f"{name}, a gate per ray", partial(lay_out, per_ray=True))] if gates_per_ray else []
-    return [GatedLayout(name, lay_out), *gated]
+    gated = [BaselineLayout(f"{name}, a gate per ray", partial(lay_out, per_ray=True))] if gates_per_ray else []
+    return [BaselineLayout(name, lay_out), *gated]
 
 
 def box_crop(views: TrainingViews, space: DesignSpace, observed: Observed) -> Crop:
