@@ -152,10 +152,8 @@ def _outcomes(
     """Drawn lengths and outcomes of each design's rays, shape (P, T, N) each."""
     casters = build_casters(scene) if planner is not None else {frame: SceneCaster(scene, frame) for frame in frames}
     found = [_first_hits(rays, [casters[frame] for frame in frames]) for rays in every]
-    if planner is None:
-        return found
     lists = [rays for one in every for rays in one]
-    physics = planner.physics(planner.plan(scene, lists, casters), seed)
+    physics = None if planner is None else planner.physics(planner.plan(scene, lists, casters), seed)
     if physics is None:
         return found
     repeats = [place for one in every for place in range(len(one))]

@@ -317,12 +317,12 @@ class _Moving:
         found = primitive_kernels.passing(*ball, self._poses[number], origins, directions, bound_m, rows, local, toward)
         return rows[:found], local[:found], toward[:found]
 
-    def enter(self, number: int, hits: Hits, rows: np.ndarray, range_m: np.ndarray, normal: np.ndarray) -> None:
-        """Write the hits of rays (K,) on a mesh into `hits`, from normals in the mesh's frame."""
-        hit = np.isfinite(range_m)
+    def enter(self, number: int, hits: Hits, rows: np.ndarray, met: Hits) -> None:
+        """Write the hits of rays (K,) on a mesh, met in the mesh's frame, into `hits`."""
+        hit = met.body >= 0
         won = rows[hit]
-        hits.range_m[won], hits.body[won] = range_m[hit], self._body[number]
-        hits.normal[won] = _turned(normal[hit], self._poses[number, :3, :3])
+        hits.range_m[won], hits.body[won] = met.range_m[hit], self._body[number]
+        hits.normal[won] = _turned(met.normal[hit], self._poses[number, :3, :3])
 
 
 def _keep_nearer(
@@ -345,8 +345,7 @@ def _keep_nearer(
         met = caster.trace(np.concatenate(local), np.concatenate(toward), bound, twice)
         ends = np.cumsum([len(some) for some in rows])
         for part, hits, some, end in zip(moving, found, rows, ends, strict=True):
-            mine = slice(end - len(some), end)
-            part.enter(number, hits, some, met.range_m[mine], met.normal[mine])
+            part.enter(number, hits, some, met.subset(slice(end - len(some), end)))
 
 
 def _turned(vectors: np.ndarray, rotation: np.ndarray) -> np.ndarray:

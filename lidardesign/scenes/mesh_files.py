@@ -230,7 +230,13 @@ def load_mesh(path: str | Path, *, sign: Sign = "auto", scale: float = 1.0, pain
     path = Path(path)
     if not (np.isfinite(scale) and scale > 0):
         raise DataError(f"the scale {scale} is not a factor to metres", where=str(path), allowed="a positive number")
-    vertices, faces, importance = _read(path, painted)
+    if path.suffix.lower() not in SUFFIXES:
+        raise DataError(f"has the suffix {path.suffix!r}", where=str(path), allowed=", ".join(SUFFIXES))
+    data = read_file(path, MESH, hint="check the path")
+    if not data.strip():
+        raise DataError("is an empty file", where=str(path))
+    # any failure to read it becomes a `DataError`
+    vertices, faces, importance = guarded(lambda: _geometry(path, data, painted), path, AGAIN_HINT)
     with np.errstate(over="ignore", invalid="ignore"):  # too large values are refused below
         vertices = vertices * scale
     return check_mesh(vertices, faces, sign=sign, where=str(path), importance=importance)
@@ -328,17 +334,6 @@ def signed_volume_m3(vertices: np.ndarray, faces: np.ndarray) -> float:
     """Enclosed volume of a closed mesh, negative when its normals point inwards [m^3]."""
     a, b, c = np.moveaxis(vertices[faces] - vertices.mean(axis=0), 1, 0)
     return float(np.einsum("fk,fk->f", a, np.cross(b, c)).sum() / 6)
-
-
-def _read(path: Path, painted: Painted | None) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Vertices, faces and weights of a file; any failure to read it becomes a `DataError`."""
-    where = str(path)
-    if path.suffix.lower() not in SUFFIXES:
-        raise DataError(f"has the suffix {path.suffix!r}", where=where, allowed=", ".join(SUFFIXES))
-    data = read_file(path, MESH, hint="check the path")
-    if not data.strip():
-        raise DataError("is an empty file", where=where)
-    return guarded(lambda: _geometry(path, data, painted), path, AGAIN_HINT)
 
 
 @contextmanager

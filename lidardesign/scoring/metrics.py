@@ -13,6 +13,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy
 
 from lidardesign.errors import DataError
 from lidardesign.numerics import SLACK
@@ -53,9 +54,7 @@ def chamfer_m(first: np.ndarray, second: np.ndarray) -> float:
 
 def nearest_m(points: np.ndarray, queries: np.ndarray) -> np.ndarray:
     """The distance of each query (M, D) to the nearest of the points (N, D), shape (M,) [m]."""
-    from scipy.spatial import cKDTree
-
-    return cKDTree(points).query(queries)[0]
+    return scipy.spatial.cKDTree(points).query(queries)[0]
 
 
 def discrete_frechet_m(first: np.ndarray, second: np.ndarray) -> float:
@@ -121,11 +120,9 @@ class SurfaceCloud:
 
         Beyond r there is no point with the probability exp(-pi n r^2), and neighbours are 0.5 / sqrt(n) apart.
         """
-        from scipy.spatial import cKDTree
-
         if len(self.points) < 2:
             return 0.0
-        return GAP_SPACINGS * float(cKDTree(self.points).query(self.points, k=2)[0][:, 1].mean())
+        return GAP_SPACINGS * float(scipy.spatial.cKDTree(self.points).query(self.points, k=2)[0][:, 1].mean())
 
     def distance_m(self, queries: np.ndarray) -> np.ndarray:
         """Exact distances to the nearest triangle [m], (N, 3) to (N,)."""
@@ -208,14 +205,12 @@ def delaunay_surface(
 
 def _delaunay_faces(directions: np.ndarray) -> tuple[np.ndarray | None, np.ndarray]:
     """Delaunay triangles (F, 3) of the directions (N, 3) in a mask, and the mask; None where they span none."""
-    from scipy.spatial import Delaunay, QhullError
-
     if len(directions) < 3:
         return None, np.ones(len(directions), dtype=bool)
     plane, seen = _stereographic(directions)
     try:
-        return Delaunay(plane[seen]).simplices, seen
-    except QhullError:  # fewer than 3 points, or all of them collinear
+        return scipy.spatial.Delaunay(plane[seen]).simplices, seen
+    except scipy.spatial.QhullError:  # fewer than 3 points, or all of them collinear
         return None, seen
 
 

@@ -28,6 +28,7 @@ from lidardesign.simulate.detector.physics import (
     Physics,
     bins_of,
     check_windows,
+    chunks,
     metres,
     resolution_m,
 )
@@ -76,7 +77,7 @@ def detect(
         return _strongest(scene, frame, windows_m, echoes, physics)
     path_m = np.full(len(windows_m), np.nan)
     light = ArrivingLight.of(rays, windows_m, echoes, background, physics)
-    for begin, end in light.bins.chunks():
+    for begin, end in chunks(light.bins.offset):
         path_m[begin:end] = _from_photons(scene, frame, light.part(begin, end), physics)
     # The body of the strongest echo near each detected half path, -1 where there is none
     tolerance = EXPLAINED_SIGMAS * metres(physics.detector.timing_sigma_s) + light.bins.width_m / 2
