@@ -64,7 +64,7 @@ def survey(views: TrainingViews, space: DesignSpace) -> Survey | None:
     low[:AZIMUTH] = high[:AZIMUTH] = middle[:AZIMUTH]
     space = replace(space, low=tuple(low.tolist()), high=tuple(high.tolist()))
     observed = views.observed(space)
-    if not len(observed.points):
+    if not len(observed):
         return None
     crop = box_crop(views, space, observed)
     directions = None if crop.directions is None else crop.directions.widened(WIDER, space)

@@ -178,7 +178,7 @@ def _random(source: Baselines) -> list[Candidate]:
 
 
 def _greedy(source: Baselines) -> list[Candidate]:
-    return [source.chosen(source.views)] if len(source.views.observed(source.space).points) else []
+    return [source.chosen(source.views)] if len(source.views.observed(source.space)) else []
 
 
 def _occupancy(source: Baselines) -> list[Candidate]:

@@ -190,8 +190,17 @@ def _score_all(
 ) -> _Scored:
     """Score all entries in all scenes, here or by workers; `known` plans are not made again."""
     jobs = {entry.key: entry for entry in entries}
-    scene_pass = request.scene_pass(lambda number: [entry.lit_in(number) for entry in jobs.values()], planner, known)
-    scenes = score_scenes(scene_pass, progress, request.starmap)
+    scenes = score_scenes(
+        request.task,
+        request.metric,
+        request.seed,
+        request.test,
+        lambda number: [entry.lit_in(number) for entry in jobs.values()],
+        planner,
+        known,
+        progress,
+        request.starmap,
+    )
     of_entries = zip(*(scene.scores for scene in scenes), strict=True)
     return _Scored(
         dict(zip(jobs, of_entries, strict=True)),
