@@ -31,6 +31,11 @@ SIZES: dict[type, Callable[..., tuple[float, float, float]]] = {
 BALL_SLACK = ROUNDING
 
 
+# Corners of a box of half extents 1, and the corners of its sides, seen from outside against the clock.
+BOX_CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64)
+BOX_QUADS = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
+
+
 class Sampled(NamedTuple):
     """Points (K, 3) [m] and the corners of each one's triangle (K, 3, 3); on primitives all three are the point."""
 

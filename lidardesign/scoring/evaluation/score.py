@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -36,7 +37,7 @@ from lidardesign.scoring.evaluation.entries import Entry, effect_notes, effect_s
 from lidardesign.scoring.evaluation.mounting import MountError
 from lidardesign.scoring.evaluation.request import EvaluationRequest, left_out
 from lidardesign.scoring.evaluation.results import Audit, Evaluation, Mounting, Paired, Row, audit_rows, middle_rays
-from lidardesign.scoring.scene_scores import score_scenes, silent_notes, without_each
+from lidardesign.scoring.scene_scores import RaysPerCondition, score_scenes, silent_notes, without_each
 from lidardesign.sensors.adaptive import AdaptiveRays
 from lidardesign.sensors.compare import outside_notes
 from lidardesign.sensors.design_file import design_document
@@ -166,11 +167,7 @@ def _mounting(
 ) -> Mounting:
     """The entries at equal rays with mounting errors, under the same effects, and their cost."""
     careless = [
-        replace(
-            entry,
-            name=str(number),
-            redraw=lambda scene, own=entry: error.misplaced(own.rays_in(scene), request.seed, scene),
-        )
+        replace(entry, name=str(number), redraw=partial(_misplaced, error, entry, request.seed))
         for number, entry in enumerate(entries)
         if entry.matched_to is None
     ]
@@ -178,6 +175,10 @@ def _mounting(
     exact = [row for row in rows if row.matched_to is None]
     found = [replace(row, design=own.design) for row, own in zip(_rows(request, careless, scored), exact, strict=True)]
     return Mounting(error, found, [_pair(row, own, request.metric) for row, own in zip(found, exact, strict=True)])
+
+
+def _misplaced(error: MountError, entry: Entry, seed: int, scene: int) -> RaysPerCondition:
+    return error.misplaced(entry.rays_in(scene), seed, scene)
 
 
 @phase("held-out scenes")
