@@ -557,7 +557,7 @@ BAD_SDF = {
     ),
     "a chain of frames": (
         f'<model name="m">{CHAIN}<link name="a"><pose relative_to="f0">0 0 0 0 0 0</pose>{{lidar}}</link></model>',
-        "is relative to too many others",
+        "too many others",
     ),
 }  # fmt: skip
 

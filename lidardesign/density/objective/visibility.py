@@ -326,13 +326,14 @@ class BodyRaycast(Visibility):
         for caster, first, last in zip(self._casters, starts[:-1], starts[1:], strict=True):
             origins, directions = local[0][first:last], local[1][first:last]
             limits = np.minimum(limit_m[row[first:last]], hits[pair[first:last]])
-            found, range_m, _, normal = caster.trace(origins, directions, limits)
+            own = caster.trace(origins, directions, limits)
+            found = np.flatnonzero(own.body >= 0)
             # a pair may meet the same mesh in two poses: the nearest is written last
-            farthest = np.argsort(-range_m, kind="stable")
-            found, range_m, normal = found[farthest], range_m[farthest], normal[farthest]
+            found = found[np.argsort(-own.range_m[found], kind="stable")]
+            normal = own.normal[found]
             facing = np.where(np.einsum("pk,pk->p", normal, directions[found]) >= 0, -1.0, 1.0)
             at, turn = first + found, bodies.to_body[body[first + found], :, :3]
-            hits[pair[at]] = range_m
+            hits[pair[at]] = own.range_m[found]
             normals[pair[at]] = np.einsum("pij,pi->pj", turn, facing[:, None] * normal)
 
 

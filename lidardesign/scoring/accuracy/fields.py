@@ -339,7 +339,8 @@ class VisibilityCase:
 
     def measure(self, setting: str, target: Target, exact: np.ndarray, *, default: bool) -> Measurement:
         """A target's error at as many probes as there are exact values (N,), and its time for a batch."""
-        probes, batch = self.probes.first(len(exact)), self.probes.points[: self.batch]
+        probes = Probes(self.probes.points[: len(exact)], self.probes.log_proposal[: len(exact)])
+        batch = self.probes.points[: self.batch]
         target.log_density_and_gradient(batch[:WARM_UP_PROBES])
         _, seconds, memory = timed(lambda: target.log_density_and_gradient(batch))
         errors = probes.misplaced(target.log_density(probes.points), exact)
