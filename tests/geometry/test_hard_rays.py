@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from support import references
-from support.hard_cases import hard_case
 
 from lidardesign.errors import ConfigError, LidardesignError
 from lidardesign.scenes.casting import SceneCaster
@@ -69,7 +68,7 @@ class CountingTask:
         return Score(100.0 * float(np.mean(returns[0].returned)))
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "17",
     "A ray through an edge or a vertex of a mesh",
     done="Embree's robust mode, and a second cast from a millionth of the mesh's size beside for rays that met nothing "
@@ -191,7 +190,7 @@ def document(**boresight):
     }
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "18",
     "A direction that is zero, not a number, or not of unit length",
     done="zero and not a number are errors before anything is traced; lengths are divided out, so ranges are metres; "

@@ -14,7 +14,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support import references
 from support.flows import FLOWS, draw, flow_of
-from support.hard_cases import hard_case
 from support.learning import SPACE, BallTask, Interrupter, a_trainer, config_of, result_bytes
 
 from lidardesign.cli.main import run as run_program
@@ -37,7 +36,7 @@ def interrupted(run, step, **settings):
         learn(BallTask(), config_of(**settings), run, progress=Interrupter(step))
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "23",
     "Points at or over the edge of the flow's box, knots beyond its bound, infinite and NaN inputs",
     done="points are kept inside, where densities are finite; the density is 0 outside the box and nowhere else",
@@ -88,7 +87,7 @@ class TestEdgesOfTheBox:
         assert measure.log_density_of(trainer, beyond) == -np.inf
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "24",
     "Parameters of the flow grow until float32 cannot invert its splines",
     done="discriminants are kept positive and splines evaluated in float64; every 50 steps of balancing a round trip "
@@ -179,7 +178,7 @@ class TestSteepSplines:
         assert any("log densities are off by up to 0.5 nats" in note for note in result.notes)
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "25",
     "A loss or a gradient of a step is NaN or infinite",
     done="the step is skipped and counted; five in a row take the last good weights back and halve the step size; "
@@ -297,7 +296,7 @@ def trainer_of(task, space, run, **settings):
     return make_trainer(data, config, run, torch.device("cpu")), data, config
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "26",
     "A target of modes far apart, of which the reverse KL drops some",
     done="sigma is annealed from six times its value and most steps balance by independent proposals; coverage, "
@@ -336,7 +335,7 @@ class TestModesFarApart:
         assert 0 < trainer.settings.pathwise_steps < trainer.settings.steps
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "27",
     "A target that is next to a point or constant, a single scene, a single free dimension",
     done="all of them are learned, with finite figures that agree with the closed forms",

@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 from support import references
 from support.designs import from_the_ceiling
 from support.fits import fitted
-from support.hard_cases import hard_case
 from support.learning import SMALL, BallTask
 from support.visibility import along_axis, both_ways, config_of, plate, transmittance_on, wall
 
@@ -171,7 +170,7 @@ def learned_at_home(tmp_path_factory):
     return learned(tmp_path_factory.mktemp("runs") / "home", 1.0, 0.0)
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "6",
     "Scenes of 0.1 mm or of 100 km, or 10,000 km from the origin",
     done="float64 throughout, fields and ray casting recentred on their meshes; densities, learned samples and fitted "
@@ -261,7 +260,7 @@ FAR_AWAY = {
 }
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "7",
     "All scenes far away: log p* below -1e5",
     done="the target stays in log space, without any log(p + epsilon); loss and gradient are finite and lead to the "
@@ -338,7 +337,7 @@ LIMITS = {
 }
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "8",
     "Sigma far below what the field resolves, or above the size of the scene",
     done="below a hundredth of a mesh field's step, or below the rounding of coordinates, it is an error that says "
@@ -431,7 +430,7 @@ ALL_KINDS = (
 )
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "9",
     "Beta large or small, occluders thinner than a step",
     done="ray casting is exact for plates of any thickness; the quadrature is refined against it until hidden points "
@@ -527,7 +526,7 @@ def cast(scene, rays, optics=OPTICS):
     return np.exp(Raycast([scene]).transmittance(rays, np.ones((len(rays.ranges), 1), bool), optics).log_values[:, 0])
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "10",
     "A ray that starts inside an occluder or exactly on a surface, or grazes one",
     done="ray casting sees what simulation returns: from inside, the way out is the first hit; on a surface it is met "

@@ -21,7 +21,6 @@ from pathlib import Path
 import pytest
 from lidardesign_tasks.flatland import FlatlandTask
 from support.command_line import files_under, make_run, program
-from support.hard_cases import hard_case
 
 from lidardesign import registry
 from lidardesign.config import load_run_config, save_run_config
@@ -81,7 +80,7 @@ def open_folder():
         yield Path(name)
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "38",
     "kill -9, a full disk or a read-only folder during a write; two processes in one run folder",
     done="files take their names by a rename when they are whole; one writer per run, whose lock outlives no kill; "
@@ -295,7 +294,7 @@ def install(tmp_path, monkeypatch):
         del sys.modules[name]
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "39",
     "A plugin that raises, leaves, hangs or crashes when it is imported, has another's name or version, or scores NaN",
     done="plugins of other packages are imported in a process of their own first, within a time limit; each is listed "
@@ -423,7 +422,7 @@ def on_a_terminal(*arguments, **environment) -> bytes:
     return shown
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "40",
     "Stdout closed early, no terminal, NO_COLOR, a locale that is not UTF-8, odd paths, SIGTERM and Ctrl-C",
     done="streams that nobody reads end the program quietly or swallow what is said; names are escaped where they "

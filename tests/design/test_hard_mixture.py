@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.fits import broken, design_of, fitted
-from support.hard_cases import hard_case
 from support.mixtures import POINT, WHOLE, Z, drawn, features_of, random_mixture, taken
 
 from lidardesign.constraints.document import Constraints
@@ -69,7 +68,7 @@ def assert_finite(mixture):
         assert np.isfinite(getattr(mixture, name)).all(), name
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "29",
     "Fewer different samples than components, duplicates, or samples on a line",
     done="standard deviations have a floor relative to the data's scale, components that lose their samples are "
@@ -172,7 +171,7 @@ def far_away(mixture, sigmas, generator):
     return points
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "30",
     "A sample sixty standard deviations from every component",
     done="responsibilities are computed in log space against the largest exponent: rows sum to 1 and the nearest "
@@ -238,7 +237,7 @@ def narrow_samples(place, count=2000):
     return points
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "31",
     "An origin, or any other dimension, that is fixed",
     done="fixed dimensions leave the density instead of getting a tiny variance; the log-likelihood counts free "

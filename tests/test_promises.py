@@ -22,7 +22,6 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 from support.command_line import files_under
 from support.fits import fitted
-from support.hard_cases import hard_case
 from support.small_runs import shifted
 from support.tables import each_row
 
@@ -82,7 +81,7 @@ def numbers_of(document, path=""):
         yield path, document
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "P1",
     "The same seed, versions and machine",
     done="the same bytes of flow, samples, designs and exports, in any process; a resumed run is the straight one",
@@ -186,7 +185,7 @@ GIVEN = {
 }
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "P2",
     "A public function is given numbers that are none, or comes to one",
     done="it raises an error that says where, or gives a defined value with a status; NaN and infinity leave nowhere",
@@ -244,7 +243,7 @@ for step in range(1, 100_000):
 KILLS = 3
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "P3",
     "The program is killed at any time",
     done="the last complete checkpoint is there and verifies; the next writer removes what the killed one left",
@@ -288,7 +287,7 @@ YAML_THAT_RUNS = (
 )
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "P4",
     "An input file holds code: pickles under any name, YAML tags, strings to be evaluated",
     done="no file runs code: YAML is read without tags, arrays without pickles, checkpoints are safetensors; such "
@@ -344,7 +343,7 @@ class TestNoFileRunsCode:
         self.refused(lidardesign("learn", "flatland", "--set", setting, "--out", tmp_path / "new"), mark)
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "P5",
     "An installed plugin is broken",
     done="it is listed with the reason and using it exits 6; every other task lists and runs as if it were not there",
@@ -361,7 +360,7 @@ FIGURES = {
 KINDS = {"standard error", "half of the 95 % interval", "rounding"}
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "P6",
     "A figure is reported",
     done="every estimate has its unit, its method and its error in `error_estimates`; tables print them",
@@ -451,7 +450,7 @@ def longer_gates(document):
     return {**document, "sensors": sensors}
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "P7",
     "Any constraints",
     done="the written design satisfies all of them, found by a checker that shares nothing with the fit, or nothing is "

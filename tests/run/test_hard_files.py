@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.hard_cases import hard_case
 from support.tables import each_row
 
 from lidardesign.config import resolve
@@ -55,7 +54,7 @@ def readers(folder):
     }
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "36",
     "YAML: alias bomb, duplicate keys, 1 MB or 32 levels, tags, `1e-3`, `no`, `1:30`, dates, unknown key, wrong type",
     done="a reader of its own with positions: bombs, tags, merge keys, repeats, depth and size are refused at "
@@ -149,7 +148,7 @@ def run(tmp_path, monkeypatch):
     return tmp_path
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "37",
     "A checkpoint that is truncated, bit-flipped, of a newer version or another flow, or a pickle renamed to it",
     done="safetensors only, its SHA-256 in the manifest, its numbers finite; its format and its parts checked before "

@@ -14,7 +14,6 @@ import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 from support import references
-from support.hard_cases import hard_case
 from support.meshes import BOX_FACES, BOX_VERTICES, write_box
 
 from lidardesign.config import DensitySettings
@@ -58,7 +57,7 @@ def mesh_of(shape):
     return Mesh(np.asarray(shape.vertices), np.asarray(shape.faces))
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "11",
     "A mesh file that is empty or garbage",
     done="an error that names the file and why (exit 3), for every format; a file that loads as no faces is one",
@@ -90,7 +89,7 @@ class TestFilesWithoutAMesh:
         assert not (tmp_path / "runs").exists()
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "12",
     "Vertices that are NaN, infinite or absurdly far; faces out of range, without area, or twice",
     done="what cannot be is refused with the file and the count; faces without area and duplicates are dropped with "
@@ -184,7 +183,7 @@ def probes_of(vertices, seed=0, count=150):
     return np.random.default_rng(seed).uniform(low - 0.1 * size, high + 0.1 * size, (count, 3))
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "13",
     "An open mesh, or one whose faces run against each other, taken for a solid",
     done="`sign: solid` refuses it, with its defects counted; `auto` turns faces that run against their neighbours, "
@@ -317,7 +316,7 @@ def asked_of(name):
 WAYS = ("primitive", "table", "table without kernels", "moving", "frames", "exact")
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "14",
     "Libraries whose signed distance is positive inside",
     done="distances are positive outside everywhere: libraries are asked for unsigned ones and the sign is put on "
@@ -372,7 +371,7 @@ SPECIAL = {
 }
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "15",
     "A query exactly at a vertex, at the centre of a sphere, on a grid point, or far outside the grid",
     done="values and gradients are finite everywhere; outside the grid the distance is the lower bound "
@@ -445,7 +444,7 @@ def many_columns(count=200):
     return [Scene((Body(Sphere(0.3), poses=rigid(translation_m=(1.0 + 0.001 * i, 0, 0))),)) for i in range(count)]
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "16",
     "10 million faces, 10 million queries",
     done="points are evaluated in chunks of bounded memory, each by itself: the same bits for any chunk size, order "

@@ -11,7 +11,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support import references
-from support.hard_cases import hard_case
 
 from lidardesign.config import DensitySettings, resolve
 from lidardesign.density.objective.target import MINIMUM_POLE_COSINE, build_target
@@ -46,7 +45,7 @@ azimuths = st.floats(-50.0, 50.0)
 elevations = st.floats(-math.pi / 2, math.pi / 2)
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "1",
     "Azimuth across 0 and 2 pi, azimuth = 2 pi, negative azimuths",
     done="angles count modulo a turn everywhere; wrapped into the bounds, densities the same on both sides of the "
@@ -91,7 +90,7 @@ class TestAzimuthAcrossTheSeam:
         assert (step <= 2e-9 * (2 * slopes + 1) + 1e-8).all()
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "2",
     "Elevation at +-pi/2, where the azimuth says nothing",
     done="the chart is sin(elevation) and densities are per solid angle; the one unbounded derivative is capped; a "
@@ -156,7 +155,7 @@ class TestElevationAtThePoles:
 TAUS = {"negative": -0.1, "infinite": math.inf, "not a number": math.nan}
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "3",
     "Range 0, negative, infinite or NaN",
     done="0 is a range, where T = 1, and what is negative or not finite is refused by the name of the field; in "
@@ -214,7 +213,7 @@ class TestRangesThatAreNone:
             build_target([BALLS], AROUND, SETTINGS, way).log_density(points)
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "4",
     "Lower bound = upper bound",
     done="such a dimension is fixed: it leaves the flow and comes back with exactly its value; with all six fixed the "
@@ -273,7 +272,7 @@ BAD_BOUNDS = {
 }
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "5",
     "Bounds upside down, NaN or infinite",
     done="a configuration error (exit 2) that names file, line and column, the dimension, and what is allowed",

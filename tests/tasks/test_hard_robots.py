@@ -23,7 +23,6 @@ from lidardesign_tasks.robot.arm_motion import (
     draw_waypoints,
 )
 from lidardesign_tasks.robot.arm_robot import load_robot
-from support.hard_cases import hard_case
 from support.robots import TOOL_M, mjcf, written
 
 from lidardesign.errors import DataError
@@ -59,7 +58,7 @@ def step_with_nan():
     return data.time, float(data.qvel[0])
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "M1",
     "A rollout is unstable: MuJoCo warns, bodies sink into each other, numbers are NaN",
     done="the motion is rejected and drawn anew, at most 50 times, from the stream of the run's seed; how often and "
@@ -130,7 +129,7 @@ class TestUnstableRollouts:
         assert refused.value.exit_code == 3
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "M2",
     "Inverse kinematics has no solution: the place is out of reach",
     done="the pose's error is checked against 1 mm and half a degree after every way-point; the motion is drawn anew, "
@@ -155,7 +154,7 @@ class TestPosesOutOfReach:
             arm.draw(0.1, 4, 1.0, np.random.default_rng(0), "train 0")
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "M3",
     "MuJoCo warns: it writes MUJOCO_LOG.TXT into the working folder",
     done="warnings are collected while robots are read and moved, become notes or reasons, and no file is written",
@@ -211,7 +210,7 @@ OUTSIDE = {
 }
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "M4",
     "A robot's XML reads files outside of its folder: includes, meshes, links, entities",
     done="every file that a model names is resolved, links followed, before MuJoCo sees the model; one outside the "

@@ -16,7 +16,6 @@ from scipy.optimize import linprog
 from support.command_line import files_under, make_run
 from support.constraints import CONTRADICTIONS, FACE, ROOM, SAMPLES
 from support.fits import MOVING, broken, design_of, fitted, log_target
-from support.hard_cases import hard_case
 
 import lidardesign.constraints.check as checker
 from lidardesign.constraints.check import check_design
@@ -163,7 +162,7 @@ BUDGETS = {
 }
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "32",
     "Constraints that contradict each other: a gate outside bounds, min above max, fewer rays than sensors",
     done="refused before anything is sampled with the smallest conflicting set by name, exit 4",
@@ -230,7 +229,7 @@ NEAR = {"gate": {"end_m": {"max": 0.5}}}
 REGION = {"origin": {"spread_m": {"max": 9.0}}}
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "33",
     "Constraints that leave almost nothing of the density",
     done="below a thousandth of the mass, or with too few effective samples, the fit is refused with the mass and what "
@@ -370,7 +369,7 @@ def clamp_and_mstep():
     return start.log_likelihood, after, within
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "34",
     "Bounds on gates, fields of view and origins that the free fit breaks",
     done="every M-step is the best one inside the bounds, and the written file is verified bound by bound by a checker "
@@ -427,7 +426,7 @@ class TestBoundsHoldOnTheWrittenFile:
 weights = st.lists(st.floats(0, 1e12), min_size=1, max_size=40).filter(lambda values: max(values) > 0)
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "35",
     "A ray budget of 0, of 1, below the number of sensors, or between equal weights",
     done="largest remainders: the sum is exact, no share is a whole ray off, ties go to the first; a fit gives "

@@ -16,7 +16,6 @@ from lidardesign_tasks.emitter import EmitterTask
 from lidardesign_tasks.face import FaceTask
 from lidardesign_tasks.flatland import FlatlandTask
 from lidardesign_tasks.warehouse import WarehouseTask
-from support.hard_cases import hard_case
 from support.heads import EVERYTHING, face_rays, heads
 from support.scoring import design, make_request, rows_by_key
 
@@ -66,7 +65,7 @@ def random_rays(count=300, seed=3):
     return origins, direction(generator.uniform(0, 2 * math.pi, count), generator.uniform(-1.5, -0.4, count))
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "19",
     "No hit, a hit before or after the gate, or a surface exactly at the gate's edge",
     done="start <= range < end is a return, nearer hides, further comes too late, nothing is a miss; every ray has "
@@ -139,7 +138,7 @@ LOST = rays_of((500.0, 500.0, 500.0), direction(np.linspace(0, 6, 9), np.full(9,
 SHUT = rays_of((500.0, 500.0, 500.0), direction(np.linspace(0, 6, 9), np.full(9, -0.5)), (1.0, 1.0))
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "20",
     "Every ray misses, or none is fired",
     done="the score is the metric's worst value with the status failed; the evaluation counts failures, never drops "
@@ -191,7 +190,7 @@ class TestEmptyReturns:
         assert delaunay_surface(nothing, np.zeros(3)) is None
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "21",
     "Effects that nothing calls for, and effects that do not exist",
     done="not imported and not a bit of the returns changed; an unknown name is an error that lists all names",
@@ -222,7 +221,7 @@ def looking_away(place, **changes):
     return Receiver(place, math.pi, 0.0, 1.0, 1.0, (0.0, 9.0), **changes)
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "22",
     "An emitter at its detector, or a pair that sees no point together",
     done="at the detector everything is monostatic to the last bit; without a shared point nothing is detected, which "
