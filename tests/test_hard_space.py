@@ -14,9 +14,8 @@ from support import references
 
 from lidardesign.config import DensitySettings, resolve
 from lidardesign.density.objective.target import MINIMUM_POLE_COSINE, build_target
-from lidardesign.errors import ConfigError, DataError, NumericalError
+from lidardesign.errors import ConfigError, NumericalError
 from lidardesign.formats.designs import load_design
-from lidardesign.formats.ray_lists import SENSOR_COLUMNS
 from lidardesign.registry import load_task
 from lidardesign.scenes.scene import Body, Plane, Scene, Sphere, rigid
 from lidardesign.space import (
@@ -48,8 +47,7 @@ elevations = st.floats(-math.pi / 2, math.pi / 2)
 @pytest.mark.hard_case(
     "1",
     "Azimuth across 0 and 2 pi, azimuth = 2 pi, negative azimuths",
-    done="angles count modulo a turn everywhere; wrapped into the bounds, densities the same on both sides of the "
-    "seam, means taken of directions, boresights in tangent planes",
+    done="angles count modulo a turn everywhere",
 )
 class TestAzimuthAcrossTheSeam:
     @given(azimuths, elevations, st.floats(-7.0, 7.0), st.floats(0.1, TURN))
@@ -93,8 +91,7 @@ class TestAzimuthAcrossTheSeam:
 @pytest.mark.hard_case(
     "2",
     "Elevation at +-pi/2, where the azimuth says nothing",
-    done="the chart is sin(elevation) and densities are per solid angle; the one unbounded derivative is capped; a "
-    "field of view is two physical angles around its boresight, the same at a pole as on the horizon",
+    done="the chart is sin(elevation) and densities are per solid angle",
 )
 class TestElevationAtThePoles:
     @pytest.mark.parametrize("way", WAYS)
@@ -158,8 +155,7 @@ TAUS = {"negative": -0.1, "infinite": math.inf, "not a number": math.nan}
 @pytest.mark.hard_case(
     "3",
     "Range 0, negative, infinite or NaN",
-    done="0 is a range, where T = 1, and what is negative or not finite is refused by the name of the field; in "
-    "bounds, configurations, design files, sensor tables and by the target density",
+    done="0 is a range, where T = 1, and what is negative or not finite is refused by the name of the field",
 )
 class TestRangesThatAreNone:
     @pytest.mark.parametrize("way", WAYS)
@@ -171,13 +167,6 @@ class TestRangesThatAreNone:
         distance = np.linalg.norm(points[:, :3] - [1.2, 0.05, 0.1], axis=1) - 0.3
         np.testing.assert_allclose(values, -np.square(distance / 0.05) / 2, rtol=1e-12, atol=1e-12)
         assert np.isfinite(gradient).all()
-
-    @pytest.mark.parametrize("text", ["[-0.1, 1]", "[0, .inf]", "[.nan, 1]", "-0.1", ".nan", "-.inf"])
-    def test_configurations_are_refused_by_name_and_place(self, tmp_path, text):
-        (tmp_path / "config.yaml").write_text(f"space:\n  range_m: {text}\n", encoding="utf-8")
-        with pytest.raises(ConfigError, match=r"space\.range_m") as caught:
-            resolve(load_task("flatland"), config_file=tmp_path / "config.yaml")
-        assert caught.value.where.startswith(f"{tmp_path / 'config.yaml'}:2:1")
 
     @pytest.mark.parametrize("value", TAUS.values(), ids=TAUS)
     @pytest.mark.parametrize("end", ["start", "end"])
@@ -195,15 +184,6 @@ class TestRangesThatAreNone:
             load_design(path)
         assert f"{path}:3:" in str(caught.value)
 
-    @pytest.mark.parametrize("value", ["-0.1", "inf", "nan"])
-    def test_sensor_tables_are_refused_by_column(self, tmp_path, value):
-        good = dict.fromkeys(SENSOR_COLUMNS, "0.1") | {"orig_cov_xy": "0", "orig_cov_xz": "0", "orig_cov_yz": "0"}
-        row = (good | {"time_mean": value}).values()
-        path = tmp_path / "table.csv"
-        path.write_text(",".join(SENSOR_COLUMNS) + "\n" + ",".join(row) + "\n", encoding="utf-8")
-        with pytest.raises(DataError, match="time_mean"):
-            load_design(path)
-
     @pytest.mark.parametrize("way", WAYS)
     @pytest.mark.parametrize("value", TAUS.values(), ids=TAUS)
     def test_the_target_density_refuses_points_by_name(self, way, value):
@@ -216,8 +196,7 @@ class TestRangesThatAreNone:
 @pytest.mark.hard_case(
     "4",
     "Lower bound = upper bound",
-    done="such a dimension is fixed: it leaves the flow and comes back with exactly its value; with all six fixed the "
-    "space is one design point, and learning it is refused, since there is nothing to learn",
+    done="such a dimension is fixed: it leaves the flow and comes back with exactly its value",
 )
 class TestFixedDimensions:
     @given(st.sets(st.integers(0, 5)), st.integers(0, 2**20), st.sampled_from(MEASURES))

@@ -119,10 +119,8 @@ class TestTheCommand:
     @pytest.mark.parametrize(
         ("least", "options"),
         [
-            ("bandwidth", ("--sensors", 2, "--rays", 16)),
             ("bandwidth", ("--sensors", 1, "--rays", 16, "--layout", "even")),
             ("rays", ("--sensors", 1, "--rays", 16)),
-            ("rays", ("--sensors", 1, "--rays", 16, "--layout", "even")),
             ("sensors", ("--rays", 16)),
             ("parts", ("--parts", "vl53l8cx", "--sensors", 2)),
         ],
@@ -144,9 +142,8 @@ class TestTheCommand:
         assert path.read_bytes() == written
         assert bool(limit) == (least == "bandwidth")
 
-    @pytest.mark.parametrize("least", ["bandwidth", "rays", "sensors"])
-    def test_ends_where_nothing_keeps_the_goal(self, lidardesign, flat, least):
-        done = lidardesign("fit", flat, "--goal", 0, "--rays", 8, "--least", least, "--json")
+    def test_ends_where_nothing_keeps_the_goal(self, lidardesign, flat):
+        done = lidardesign("fit", flat, "--goal", 0, "--rays", 8, "--layout", "even", "--json")
         assert done.code == 4
         assert done.json["error"]["conflicts"] == ["--goal"]
         assert "8 rays" in done.json["error"]["message"]
