@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from itertools import pairwise
 from types import SimpleNamespace
 
 import numpy as np
@@ -281,12 +280,6 @@ class TestScenesFarAway:
         nearest = np.linalg.norm(observed_point(points) - [1000.0, 0, 0], axis=1) - 0.5
         np.testing.assert_allclose(target.log_density(points), -np.square(nearest / 0.05) / 2, rtol=1e-12)
 
-    def test_a_scene_far_away_takes_nothing_from_one_nearby(self):
-        points = points_near()
-        near = build_target(balls(), SPACE, SETTINGS, "raycast")
-        both = build_target([*balls(), *FAR_AWAY["balls"]], SPACE, SETTINGS, "raycast")
-        np.testing.assert_array_equal(both.log_density(points), near.log_density(points))
-
     @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
     @pytest.mark.parametrize("sigma_m", [0.005, 1e-6])
     def test_both_losses_and_their_gradients_are_finite(self, dtype, sigma_m):
@@ -481,17 +474,6 @@ class TestThinOccludersAndAnyBeta:
         assert (depth >= 0).all()
         # midpoints move with the range: of a surface, one step more or less
         assert (np.diff(depth) >= -beta * 2.4 / 1024 - 1e-12).all()
-
-    def test_the_error_of_the_quadrature_falls_with_its_points(self):
-        scene = Scene((plate(0.1),))
-        field = build_field([scene], lambda one: True, resolution=16, padding_m=0.02)
-        optics, ranges = Optics(0.01, 20.0, 1000.0, 0.01), np.linspace(1.2, 2.4, 50)
-        errors = []
-        for points in (32, 128, 512, 2048):
-            found = Quadrature(field, points).transmittance(along_axis(ranges), np.ones((50, 1), bool), optics)
-            errors.append(np.abs(found.log_values + 20.0 * 0.1).max())
-        assert all(finer < coarser for coarser, finer in pairwise(errors))
-        assert errors[-1] < 20.0 * 2.4 / 2048
 
 
 SOLIDS = {

@@ -1,4 +1,4 @@
-"""Hard cases of constraints: contradictions, almost nothing left, exact bounds, and budgets that do not divide."""
+"""Constraints: contradictions, almost nothing left, exact bounds, and budgets that do not divide."""
 
 from __future__ import annotations
 
@@ -24,10 +24,6 @@ from lidardesign.constraints.document import Constraints
 from lidardesign.constraints.feasibility import check_feasible
 from lidardesign.errors import DataError, InfeasibleError
 from lidardesign.fitting import fit as fit_design
-from lidardesign.mixture.bounds import Bounds
-from lidardesign.mixture.components import Axes, Features, log_density
-from lidardesign.mixture.em import fit_mixture
-from lidardesign.mixture.ensemble import admitted_mixture
 from lidardesign.mixture.support import LEAST_MASS
 from lidardesign.run.yaml import load_yaml
 from lidardesign.samples import Samples
@@ -35,10 +31,7 @@ from lidardesign.scenes.scene import Body, Scene, Sphere
 from lidardesign.scoring import metrics
 from lidardesign.sensors.bandwidth import split_budget
 from lidardesign.sensors.design_file import design_document, design_from_document
-from lidardesign.sensors.sensor import interval_factor
 from lidardesign.space import DesignSpace
-
-Z = interval_factor(0.95)
 
 
 def even(points):
@@ -46,42 +39,20 @@ def even(points):
     return np.zeros(len(points))
 
 
-def entry(values, index, parts):
-    """Where a key path stands: a mapping and its last key."""
-    place = values if index is None else values["each"][index]
-    for part in parts[:-1]:
-        if not isinstance(place[part], dict):
-            return place, part
-        place = place[part]
-    return place, parts[-1]
-
-
-def path_of(name):
-    """The entry of `each`, or None, and the keys of a constraint's name."""
-    if not name.startswith("each["):
-        return None, name.split(".")
-    index, _, rest = name.removeprefix("each[").partition("].")
-    return int(index), rest.split(".")
-
-
-def only(values, names):
-    """A constraint file that says nothing but what has these names."""
-    kept = {}
-    for name in names:
-        if name.startswith(("space.", "--")):
-            continue
-        index, parts = path_of(name.split("[")[0] if name.startswith("origin.") else name)
-        if parts == ["each"]:
-            kept.setdefault("each", [{} for _ in values["each"]])
-            continue
-        source, key = entry(values, index, parts)
-        if index is not None:
-            kept.setdefault("each", [{} for _ in values["each"]])
-        target = kept if index is None else kept["each"][index]
-        for part in parts[: parts.index(key)]:
-            target = target.setdefault(part, {})
-        target[key] = source[key]
-    return kept
+def only(values, names, path=""):
+    """What a constraint file says under these names."""
+    found = {}
+    for key, value in values.items():
+        name = f"{path}{key}"
+        if key == "each":
+            entries = [only(one, names, f"each[{index}].") for index, one in enumerate(value)]
+            if any(entries) or key in names:
+                found[key] = entries
+        elif any(name == one.split("[")[0] or name == one for one in names):
+            found[key] = value
+        elif isinstance(value, dict) and (inner := only(value, names, f"{name}.")):
+            found[key] = inner
+    return found
 
 
 def conflicts_of(values, space, **asked):
@@ -140,15 +111,6 @@ BUDGETS = {
         {"budget": {"bandwidth_mbps": 0.1, "rays": 20}, "gate": {"start_m": {"max": 0.2}, "end_m": {"min": 0.8}}},
         {},
         {"budget.rays", "budget.bandwidth_mbps", "gate.start_m.max", "gate.end_m.min"},
-    ),
-    "wide gates of all": (
-        {
-            "budget": {"bandwidth_mbps": 0.1, "rays": 20},
-            "gate": {"width_m": {"min": 0.4}},
-            "each": [{}, {"gate": {"width_m": {"min": 0.6}}}],
-        },
-        {},
-        {"budget.rays", "budget.bandwidth_mbps", "gate.width_m.min"},
     ),
     "one ray too wide": (
         {"budget": {"bandwidth_mbps": 0.02, "rays": 20}, "gate": {"width_m": {"min": 0.9}}},
@@ -300,7 +262,9 @@ def optional(**keys):
 def constraint_files(**origin):
     """Constraint files that may contradict themselves; `origin` are further keys of origins."""
     bounds = {
-        "gate": optional(width_m=most(0.05, 1.2), start_m=least(0, 0.6), end_m=most(0.5, 1.5)),
+        "gate": optional(
+            width_m=most(0.05, 1.2), start_m=least(0, 0.6) | most(0.3, 1.0), end_m=most(0.5, 1.5) | least(0.5, 1.2)
+        ),
         "field_of_view": optional(horizontal_deg=most(2, 90), vertical_deg=most(2, 90)),
         "boresight": optional(
             azimuth_deg=st.builds(
@@ -322,23 +286,6 @@ corners = st.lists(st.floats(-1, 0.5), min_size=3, max_size=3)
 boxes = corners.map(lambda low: [{"low_m": low, "high_m": [value + 0.6 for value in low]}])
 
 
-def clamp_and_mstep():
-    """Log-likelihoods of ranges: fitted freely, with gates clamped afterwards, and with gates bounded while fitting."""
-    generator = np.random.default_rng(0)
-    points = np.zeros((2000, 6))
-    points[:, 5] = 2.0 + generator.gamma(1.0, 0.2, 2000)
-    space = DesignSpace((0, 0, 0, 0, 0, 0.1), (0, 0, 0, 0, 0, 9.0))
-    features = Features.of(points, np.ones(2000), Axes.of(space), space)
-    start = fit_mixture(features, Bounds.unbounded(2, Z), np.random.default_rng(1))
-    two = Bounds.unbounded(2, Z).narrowed(0.2)
-    clamped = admitted_mixture(start.mixture, features, Bounds.unbounded(2, Z))
-    rows = {name: getattr(clamped, name).copy() for name in clamped.__dataclass_fields__}
-    rows["spread_range_m"] = np.minimum(rows["spread_range_m"], 0.2 / (2 * Z))
-    after = float(features.weights @ log_density(type(clamped)(**rows), features))
-    within = fit_mixture(features, two, np.random.default_rng(1)).log_likelihood
-    return start.log_likelihood, after, within
-
-
 @pytest.mark.hard_case(
     "34",
     "Bounds on gates, fields of view and origins that the free fit breaks",
@@ -346,10 +293,6 @@ def clamp_and_mstep():
     "that shares no code with the fit",
 )
 class TestBoundsHoldOnTheWrittenFile:
-    def test_bounds_in_the_m_step_lose_less_than_clamping_after_the_fit(self):
-        free, after, within = clamp_and_mstep()
-        assert free >= within > after + 0.1
-
     @settings(max_examples=25)
     @given(constraint_files(low_m=corners, thickness_m=most(1e-3, 0.2), exclude=boxes))
     def test_any_file_is_kept_exactly_or_refused_with_what_stands_against_it(self, values):
@@ -371,18 +314,6 @@ class TestBoundsHoldOnTheWrittenFile:
             assert [check for check in check_design(written, values, ROOM) if not check.satisfied] == []
         assert found.rays == values.get("budget", {}).get("rays")
 
-    @pytest.mark.parametrize("mbps", [0.05, 0.2])
-    def test_a_bandwidth_that_narrows_gates_leaves_their_other_bounds(self, mbps):
-        # the start must come early and the end late: narrowing has to stop between
-        values = {
-            "gate": {"start_m": {"max": 1.0}, "end_m": {"min": 1.3}}, "sensors": {"count": 2},
-            "budget": {"bandwidth_mbps": mbps, "rays": 5},
-        }  # fmt: skip
-        if conflicts_of(values, ROOM):
-            assert mbps == 0.05
-            return
-        assert broken(fitted(SAMPLES, values, retarget=even), values, ROOM) == []
-
     def test_the_checker_shares_no_code_with_the_fit(self):
         # parts have to be looked up, and angles mean what they mean: data and conventions, nothing of the fit
         parts = {f"lidardesign.parts.{name}" for name in ("catalogue", "part")}
@@ -401,16 +332,7 @@ weights = st.lists(st.floats(0, 1e12), min_size=1, max_size=40).filter(lambda va
     done="largest remainders: the sum is exact, no share is a whole ray off, ties go to the first",
 )
 class TestBudgetsThatDoNotDivide:
-    @given(st.permutations(range(6)), st.integers(0, 400))
-    def test_the_order_of_sensors_matters_only_between_equal_ones(self, order, rays):
-        weights = np.array([0.31, 0.05, 0.17, 0.23, 0.11, 0.13])
-        order = np.array(order)
-        quotas = weights * rays
-        remainders = np.sort(quotas - np.floor(quotas))
-        assume((np.diff(remainders) > 1e-6).all())
-        np.testing.assert_array_equal(split_budget(weights[order], rays), split_budget(weights, rays)[order])
-
-    @pytest.mark.parametrize("rays", [1, 2, 3, 4, 5])
+    @pytest.mark.parametrize("rays", [1, 3])
     def test_a_fit_has_no_more_sensors_than_rays_where_their_number_is_open(self, rays):
         found = fitted(SAMPLES, REGION, rays=rays, em_samples=1200, restarts=1)
         assert len(found.sensors) <= rays == found.rays

@@ -1,4 +1,4 @@
-"""Hard cases of mixtures: data that do not fill their space, samples far from everything, dimensions that are fixed."""
+"""Mixtures: data that do not fill their space, samples far from everything, dimensions that are fixed."""
 
 from __future__ import annotations
 

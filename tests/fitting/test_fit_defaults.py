@@ -31,26 +31,27 @@ def resolved(run, base=None, **options):
 
 class TestWhatIsLeftOpen:
     @pytest.mark.parametrize(
-        ("options", "layout", "sensors"),
+        ("options", "expected"),
         [
-            ({}, "chosen", BEST),
-            ({"constraints": {"gate": {"width_m": {"max": 0.3}}}}, "chosen", BEST),
-            ({"constraints": {"sensors": {"min": 2, "max": 3}}}, "chosen", BEST),
-            ({"constraints": {"sensors": {"count": 3}}}, "chosen", 3),
-            ({"constraints": MOUNTS}, "chosen", None),
-            ({"constraints": {**MOUNTS, "sensors": {"count": 1}}}, "chosen", 1),
-            ({"constraints": {"parts": {"names": "catalog", "count": 2}}}, "even", 2),
-            ({"parts": ["vl53l8cx"], "sensors": 3}, "even", 3),
-            ({"weights": ["variation=0.5"]}, "chosen", BEST),
-            ({"layout": "even"}, "even", BEST),
-            ({"layout": "spinning"}, "spinning", 1),
-            ({"sensors": 2}, "chosen", 2),
-            ({"sensors": 2, "layout": "even"}, "even", 2),
+            ({}, {"layout": "chosen", "sensors": BEST, "level": CHOSEN_LEVEL, "counts": [8, 16, 32, 64]}),
+            ({"rays": 9}, {"counts": [9]}),
+            ({"level": 0.8}, {"layout": "chosen", "level": 0.8}),
+            ({"constraints": {"gate": {"width_m": {"max": 0.3}}}}, {"layout": "chosen", "sensors": BEST}),
+            ({"constraints": {"sensors": {"min": 2, "max": 3}}}, {"layout": "chosen", "sensors": BEST}),
+            ({"constraints": {"sensors": {"count": 3}}}, {"layout": "chosen", "sensors": 3}),
+            ({"constraints": MOUNTS}, {"layout": "chosen", "sensors": None}),
+            ({"constraints": {**MOUNTS, "sensors": {"count": 1}}}, {"layout": "chosen", "sensors": 1}),
+            ({"constraints": {"parts": {"names": "catalog", "count": 2}}}, {"layout": "even", "sensors": 2}),
+            ({"parts": ["vl53l8cx"], "sensors": 3}, {"layout": "even", "sensors": 3}),
+            ({"weights": ["variation=0.5"]}, {"layout": "chosen", "sensors": BEST}),
+            ({"layout": "even"}, {"sensors": BEST, "level": 0.95, "counts": [8, 16, 32, 64]}),
+            ({"layout": "spinning"}, {"sensors": 1}),
+            ({"sensors": 2}, {"layout": "chosen", "sensors": 2}),
         ],
     )
-    def test_follows_from_what_is_asked_for(self, made, options, layout, sensors):
+    def test_follows_from_what_is_asked_for(self, made, options, expected):
         request = resolved(made, **options)
-        assert (request.layout, request.sensors) == (layout, sensors)
+        assert {name: getattr(request, name) for name in expected} == expected
 
     @pytest.mark.parametrize(("at", "gates"), [({}, "ray"), ({"x_m": 0.5}, "sensor")])
     def test_rays_that_follow_a_condition_have_gates_of_their_own(self, tmp_path, at, gates):
@@ -60,24 +61,6 @@ class TestWhatIsLeftOpen:
     def test_a_task_that_does_not_say_what_returns_tell_has_even_rays(self, made, monkeypatch):
         monkeypatch.setattr(requests, "informs_rays", lambda task: False)
         assert resolved(made).layout == "even"
-
-    @pytest.mark.parametrize(
-        ("options", "level"),
-        [
-            ({}, CHOSEN_LEVEL),
-            ({"layout": "even"}, 0.95),
-            ({"level": 0.8}, 0.8),
-            ({"level": 0.8, "layout": "even"}, 0.8),
-        ],
-    )
-    def test_chosen_rays_lie_in_wide_fields(self, made, options, level):
-        assert resolved(made, **options).level == level
-
-    @pytest.mark.parametrize(
-        ("options", "counts"), [({}, [8, 16, 32, 64]), ({"rays": 9}, [9]), ({"layout": "even"}, [8, 16, 32, 64])]
-    )
-    def test_the_tasks_numbers_of_rays_are_chosen_where_nobody_names_one(self, made, options, counts):
-        assert resolved(made, **options).counts == counts
 
     @pytest.mark.parametrize("layout", ["even", "chosen", "spinning"])
     def test_is_the_designs_where_one_is_fitted_again(self, made, layout):

@@ -1,4 +1,4 @@
-"""Hard cases of rays and meshes: vertices and edges, and directions that are none."""
+"""Rays at meshes: vertices and edges, and directions that are none."""
 
 from __future__ import annotations
 

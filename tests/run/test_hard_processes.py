@@ -166,6 +166,11 @@ class TestKillsFullDisksAndTwoWriters:
             assert result.code == (2 if damage == "cut inside" else 0), result.err
             assert said in result.err
 
+    @pytest.mark.hard_case(
+        "P3",
+        "The program is killed at any time",
+        done="the last complete checkpoint is there and verifies",
+    )
     @pytest.mark.slow
     def test_kills_at_steps_spread_over_learn_fit_and_evaluate_are_all_recovered(self, tmp_path):
         tests = str(Path(__file__).parents[1])

@@ -1,4 +1,4 @@
-"""Hard cases of simulation: gates, empty returns, effects that nothing calls for, emitter and detector at one place."""
+"""Simulation: gates, empty returns, effects that nothing calls for, emitter and detector at one place."""
 
 from __future__ import annotations
 
@@ -24,21 +24,18 @@ from lidardesign.errors import DataError
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import Outcome, Rays, path_of_range, path_windows, range_of_path
 from lidardesign.scenes.scene import Body, Box, Plane, Receiver, Scene, Sphere, rigid
-from lidardesign.scenes.surface import sample_triangles
 from lidardesign.scoring.evaluation.score import evaluate
 from lidardesign.scoring.metrics import (
-    SurfaceCloud,
     chamfer_m,
     delaunay_surface,
     discrete_frechet_m,
-    visible_surface,
 )
 from lidardesign.scoring.scene_scores import checked_score
 from lidardesign.simulate.detector.files import load_detector
-from lidardesign.simulate.detector.physics import IDEAL, Detector, Physics
+from lidardesign.simulate.detector.physics import IDEAL, Physics
 from lidardesign.simulate.plan import Planner
 from lidardesign.simulate.returns import simulate
-from lidardesign.space import DesignSpace, direction
+from lidardesign.space import direction
 from lidardesign.task import conditions_of
 
 
@@ -171,10 +168,6 @@ class TestEmptyReturns:
             for pair in ((points, nothing), (nothing, points), (nothing, nothing)):
                 with pytest.raises(ValueError, match="without points has no distance"):
                     measure(*pair)
-        with pytest.raises(ValueError, match="without points"):
-            SurfaceCloud(nothing, np.zeros((0, 3, 3)))
-        with pytest.raises(ValueError, match="without faces"):
-            sample_triangles(points, np.zeros((0, 3), dtype=int), 10, np.random.default_rng(0))
         assert delaunay_surface(nothing, np.zeros(3)) is None
 
 
@@ -193,15 +186,6 @@ class TestEffectsNotCalledFor:
             (everything,) = simulate(head, rays, physics=Physics(detector, calm | more))
             for name in ("outcome", "range_m", "body"):
                 assert getattr(planned, name).tobytes() == getattr(everything, name).tobytes()
-
-    @pytest.mark.parametrize("effect", ["footprint", "motion", "specular", "shadowing", "atmosphere"])
-    def test_effects_of_geometry_leave_a_plain_scene_as_geometry_has_it(self, effect):
-        (head,) = heads()[:1]
-        thin = Detector("thin", pulse_sigma_s=1e-12)
-        (alone,) = simulate(head, face_rays())
-        (measured,) = simulate(head, face_rays(), physics=Physics(thin, frozenset({effect})))
-        for name in ("outcome", "range_m", "body"):
-            assert getattr(alone, name).tobytes() == getattr(measured, name).tobytes()
 
 
 def looking_away(place, **changes):
@@ -263,20 +247,6 @@ class TestEmitterAndDetectorTogetherOrBlind:
             assert (heard.outcome[lit.returned] == Outcome.NOT_DETECTED).all(), name
             score = checked_score(task, task.metric, replace(one, truth=scene.truth), [heard])
             assert (score.failed, score.value) == (True, task.metric.worst), name
-
-    def test_a_pair_that_sees_no_point_together_leaves_no_truth(self):
-        wall = Body(Box((0.001, 5.0, 5.0)), "wall", "occluder", rigid(translation_m=(1.0, 0.0, 0.0)))
-        space = DesignSpace((0.0, 0.0, 0.0, -0.5, -0.5, 0.1), (0.0, 0.0, 0.0, 0.5, 0.5, 9.0))
-        towards = Receiver((0.0, 0.3, 0.0), 0.0, 0.0, 1.0, 1.0, (0.0, 9.0))
-        generator = np.random.default_rng(2)
-        assert len(visible_surface(Scene((BALL,), receiver=towards), space, 50, generator).points) == 50
-        for scene in (
-            Scene((BALL,), receiver=looking_away((0.0, 0.3, 0.0))),
-            Scene((BALL, wall), receiver=replace(towards, origin_m=(0.9, 0.3, 0.0))),
-        ):
-            with pytest.raises(DataError, match="no ray of the design space sees") as caught:
-                visible_surface(scene, space, 50, generator)
-            assert caught.value.exit_code == 3
 
     def test_learning_for_a_receiver_that_sees_nothing_is_refused_before_it_starts(self):
         points = np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 2.5]])

@@ -1,4 +1,4 @@
-"""Hard cases of moving robots: motions that MuJoCo cannot vouch for, poses out of reach, files where none belong."""
+"""Moving robots: motions that MuJoCo cannot vouch for, poses out of reach, files where none belong."""
 
 from __future__ import annotations
 
