@@ -8,9 +8,9 @@ from dataclasses import replace
 
 import pytest
 from hypothesis import given
-from lidardesign.api.made import open_run
 from support.strategies import adaptive_designs
 
+from lidardesign.api.run import open_run
 from lidardesign.constraints.check import check_design
 from lidardesign.errors import ConfigError
 from lidardesign.formats.designs import load_design
@@ -185,22 +185,3 @@ class TestAFit:
             assert lidardesign("fit", made, "--rays", 9, "--sensors", 1, "--name", "one", *options).code == 0
             written.append((made / "designs" / "one.yaml").read_bytes())
         assert written[0] == written[1]
-
-    @pytest.mark.parametrize(
-        ("options", "words"),
-        [
-            (["--layout", "even"], "layout even"),
-            (["--layout", "spinning"], "layout spinning"),
-            (["--parts", "vl53l5cx"], "real parts"),
-            (["--sensors", "2", "--survive", "1"], "patterns that follow what they see"),
-            (["--goal", "20"], "a goal for patterns that follow what they see"),
-            (["--adaptive", "0"], "--adaptive: 0"),
-            (["--adaptive", "65"], "--adaptive: 65"),
-        ],
-    )
-    def test_refuses_what_patterns_cannot_follow(self, lidardesign, made, options, words):
-        done = lidardesign("fit", made, "--sensors", 1, "--adaptive", 2, "--name", "none", *options)
-        assert done.code == 2
-        assert "--adaptive" in done.err
-        assert words in done.err
-        assert not (made / "designs" / "none.yaml").exists()

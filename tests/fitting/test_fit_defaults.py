@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from types import SimpleNamespace
 
 import numpy as np
@@ -73,8 +74,8 @@ class TestWhatIsLeftOpen:
         assert resolved(made, base, constraints={"sensors": {"max": 1}}).sensors == 1
 
 
-# What excludes each other: options, and the argument that is named.
-CONTRADICTIONS = [
+# What excludes each other or cannot be: options, and the argument that is named.
+REFUSED = [
     ({"layout": "even", "gates": "ray"}, "gates"),
     ({"layout": "spinning", "gates": "ray"}, "gates"),
     ({"channels": 4}, "channels"),
@@ -86,11 +87,30 @@ CONTRADICTIONS = [
     ({"parts": ["vl53l8cx"], "sensors": 1, "layout": "even"}, "parts"),
     ({"parts": ["vl53l8cx"], "sensors": 1, "gates": "sensor"}, "parts"),
     ({"parts": ["vl53l8cx"], "sensors": 1, "weights": ["variation=0.5"]}, "parts"),
+    *(({"goal": goal}, "goal") for goal in (math.nan, math.inf, -1, 501, True, "6")),
+    ({"least": "rays"}, "least"),
+    ({"goal": 100, "least": "weight"}, "least"),
+    ({"goal": 100, "least": "parts"}, "least"),
+    ({"goal": 100, "least": "rays", "parts": ["vl53l8cx"], "sensors": 2}, "least"),
+    ({"goal": 100, "least": "sensors", "sensors": 2}, "sensors"),
+    ({"goal": 100, "layout": "spinning"}, "goal"),
+    ({"survive": 1, "sensors": 1}, "survive"),
+    ({"survive": 1, "constraints": {"sensors": {"max": 1}}}, "survive"),
+    ({"survive": 1, "sensors": 3, "layout": "even"}, "survive"),
+    ({"survive": 1, "sensors": 3, "layout": "spinning"}, "survive"),
+    ({"survive": 1, "sensors": 3, "parts": "catalog"}, "survive"),
+    ({"adaptive": 2, "layout": "even"}, "adaptive"),
+    ({"adaptive": 2, "layout": "spinning", "sensors": 1}, "adaptive"),
+    ({"adaptive": 2, "parts": ["vl53l5cx"], "sensors": 1}, "adaptive"),
+    ({"adaptive": 2, "sensors": 2, "survive": 1}, "adaptive"),
+    ({"adaptive": 2, "goal": 20}, "adaptive"),
+    ({"adaptive": 0}, "adaptive"),
+    ({"adaptive": 65}, "adaptive"),
 ]
 
 
-@pytest.mark.parametrize(("options", "argument"), CONTRADICTIONS)
-def test_options_that_exclude_each_other_are_refused_by_name(made, options, argument):
+@pytest.mark.parametrize(("options", "argument"), REFUSED)
+def test_options_that_exclude_each_other_or_cannot_be_are_refused_by_name(made, options, argument):
     with pytest.raises(ConfigError) as refused:
         open_run(made).fit(**options)
     assert refused.value.where.split()[0] == argument

@@ -1,4 +1,4 @@
-"""The register of hard cases, read from the source of tests; `tools/stability_table.py` writes docs/stability.md from it.
+"""The register of hard cases, read from the source of tests; `tools/stability_table.py` writes its page from it.
 
 `@pytest.mark.hard_case("29", "What comes in", done="What the program does then")` stands once for each case, at the
 class of its tests. `@pytest.mark.hard_case("29")` marks further tests of it.
