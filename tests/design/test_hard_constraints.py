@@ -359,7 +359,7 @@ def longer_gates(document):
     "written and the command exits 4",
 )
 class TestDesignsKeepTheirConstraints:
-    @settings(max_examples=10)
+    @settings(max_examples=6)
     @given(constraint_files(), st.sampled_from(["even", "chosen"]))
     def test_the_written_design_satisfies_them_all_or_the_command_exits_4(self, made, rules, layout):
         folder = made.parent / "tried"
