@@ -1,4 +1,4 @@
-"""Hard cases of rays and meshes: vertices and edges, and directions that are none."""
+"""Rays at meshes: vertices and edges, and directions that are none."""
 
 from __future__ import annotations
 
@@ -11,16 +11,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from support import references
-from support.hard_cases import hard_case
 
-from lidardesign.errors import ConfigError, LidardesignError
+from lidardesign.errors import ConfigError
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Scene, Sphere, rigid
-from lidardesign.scenes.triangles import BESIDE_SHARE, SecondCasts, Triangles
+from lidardesign.scenes.triangles import BESIDE_SHARE, SecondCasts
 from lidardesign.scoring.evaluation.score import slipped_notes
 from lidardesign.scoring.scene_scores import score_in_scene
-from lidardesign.sensors.design_file import design_from_document
 from lidardesign.simulate.plan import Planner
 from lidardesign.task import Metric, Score
 
@@ -69,20 +67,13 @@ class CountingTask:
         return Score(100.0 * float(np.mean(returns[0].returned)))
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "17",
     "A ray through an edge or a vertex of a mesh",
-    done="Embree's robust mode, and a second cast from a millionth of the mesh's size beside for rays that met nothing "
-    "or a triangle's back; how many that found is counted and noted in the evaluation",
+    done="Embree's robust mode, and a second cast from a millionth of the mesh's size beside for rays that met "
+    "nothing or a triangle's back",
 )
 class TestRaysThroughEdgesAndVertices:
-    def test_embree_runs_in_its_robust_mode(self):
-        triangles = Triangles([mesh_of(BALL)])
-        vertices = np.asarray(BALL.vertices, dtype=np.float32)
-        limit = np.full(len(vertices), 1e30, dtype=np.float32)
-        alone = (triangles.run(np.zeros_like(vertices), vertices, limit)["primID"] < 0).mean()
-        assert 0 < alone < 0.01
-
     @pytest.mark.parametrize("start", STARTS)
     @pytest.mark.parametrize("name", SOLIDS)
     def test_none_is_lost_and_all_are_met_where_they_aim(self, name, start):
@@ -177,25 +168,10 @@ ONE_OF_EACH = {
 }
 
 
-def document(**boresight):
-    return {
-        "schema_version": 2,
-        "sensors": [
-            {
-                "origin_m": {"mean": [0.0, 0.0, 0.0]},
-                "boresight": {"azimuth_rad": 0.0, "elevation_rad": 0.0, **boresight},
-                "field_of_view_rad": {"horizontal": 0.1, "vertical": 0.1},
-                "gate_m": {"start": 0.9, "end": 1.1},
-            }
-        ],
-    }
-
-
-@hard_case(
+@pytest.mark.hard_case(
     "18",
     "A direction that is zero, not a number, or not of unit length",
-    done="zero and not a number are errors before anything is traced; lengths are divided out, so ranges are metres; "
-    "ray lists take unit vectors only",
+    done="zero and not a number are errors before anything is traced",
 )
 class TestDirectionsThatAreNone:
     @pytest.mark.parametrize("case", BAD_DIRECTIONS)
@@ -222,9 +198,3 @@ class TestDirectionsThatAreNone:
                 Rays(np.zeros((1, 3)), np.array([bad]), gate, one, one)
         with pytest.raises(ConfigError, match="NaN or infinite"):
             Rays(np.zeros((1, 3)), np.array([[np.nan, 0.0, 0.0]]), gate, one, one)
-
-    @pytest.mark.parametrize("key", ["azimuth_rad", "elevation_rad"])
-    @pytest.mark.parametrize("value", [float("nan"), float("inf"), None, "north"])
-    def test_a_design_whose_boresight_is_none_is_refused_with_its_place(self, key, value):
-        with pytest.raises(LidardesignError, match=key):
-            design_from_document(document(**{key: value}))

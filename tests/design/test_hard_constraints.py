@@ -1,10 +1,11 @@
-"""Hard cases of constraints: contradictions, almost nothing left, exact bounds, and budgets that do not divide."""
+"""Constraints: contradictions, almost nothing left, exact bounds, and budgets that do not divide."""
 
 from __future__ import annotations
 
 import ast
 import json
 import math
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -13,72 +14,45 @@ import yaml
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
-from support.command_line import files_under, make_run
 from support.constraints import CONTRADICTIONS, FACE, ROOM, SAMPLES
 from support.fits import MOVING, broken, design_of, fitted, log_target
-from support.hard_cases import hard_case
 
 import lidardesign.constraints.check as checker
+from lidardesign.cli.main import run as run_program
 from lidardesign.constraints.check import check_design
 from lidardesign.constraints.document import Constraints
 from lidardesign.constraints.feasibility import check_feasible
-from lidardesign.errors import InfeasibleError
-from lidardesign.mixture.bounds import Bounds
-from lidardesign.mixture.components import Axes, Features, log_density
-from lidardesign.mixture.em import fit_mixture
-from lidardesign.mixture.ensemble import admitted_mixture
+from lidardesign.errors import DataError, InfeasibleError
+from lidardesign.fitting import fit as fit_design
 from lidardesign.mixture.support import LEAST_MASS
+from lidardesign.run.yaml import load_yaml
 from lidardesign.samples import Samples
-from lidardesign.scoring.metrics import DRAW_ROUNDS
+from lidardesign.scenes.scene import Body, Scene, Sphere
+from lidardesign.scoring import metrics
 from lidardesign.sensors.bandwidth import split_budget
 from lidardesign.sensors.design_file import design_document, design_from_document
-from lidardesign.sensors.sensor import interval_factor
 from lidardesign.space import DesignSpace
 
-Z = interval_factor(0.95)
 
-
-def flat(points):
+def even(points):
     """log p* of the room's samples but for their noise."""
     return np.zeros(len(points))
 
 
-def entry(values, index, parts):
-    """Where a key path stands: a mapping and its last key."""
-    place = values if index is None else values["each"][index]
-    for part in parts[:-1]:
-        if not isinstance(place[part], dict):
-            return place, part
-        place = place[part]
-    return place, parts[-1]
-
-
-def path_of(name):
-    """The entry of `each`, or None, and the keys of a constraint's name."""
-    if not name.startswith("each["):
-        return None, name.split(".")
-    index, _, rest = name.removeprefix("each[").partition("].")
-    return int(index), rest.split(".")
-
-
-def only(values, names):
-    """A constraint file that says nothing but what has these names."""
-    kept = {}
-    for name in names:
-        if name.startswith(("space.", "--")):
-            continue
-        index, parts = path_of(name.split("[")[0] if name.startswith("origin.") else name)
-        if parts == ["each"]:
-            kept.setdefault("each", [{} for _ in values["each"]])
-            continue
-        source, key = entry(values, index, parts)
-        if index is not None:
-            kept.setdefault("each", [{} for _ in values["each"]])
-        target = kept if index is None else kept["each"][index]
-        for part in parts[: parts.index(key)]:
-            target = target.setdefault(part, {})
-        target[key] = source[key]
-    return kept
+def only(values, names, path=""):
+    """What a constraint file says under these names."""
+    found = {}
+    for key, value in values.items():
+        name = f"{path}{key}"
+        if key == "each":
+            entries = [only(one, names, f"each[{index}].") for index, one in enumerate(value)]
+            if any(entries) or key in names:
+                found[key] = entries
+        elif any(name == one.split("[")[0] or name == one for one in names):
+            found[key] = value
+        elif isinstance(value, dict) and (inner := only(value, names, f"{name}.")):
+            found[key] = inner
+    return found
 
 
 def conflicts_of(values, space, **asked):
@@ -138,15 +112,6 @@ BUDGETS = {
         {},
         {"budget.rays", "budget.bandwidth_mbps", "gate.start_m.max", "gate.end_m.min"},
     ),
-    "wide gates of all": (
-        {
-            "budget": {"bandwidth_mbps": 0.1, "rays": 20},
-            "gate": {"width_m": {"min": 0.4}},
-            "each": [{}, {"gate": {"width_m": {"min": 0.6}}}],
-        },
-        {},
-        {"budget.rays", "budget.bandwidth_mbps", "gate.width_m.min"},
-    ),
     "one ray too wide": (
         {"budget": {"bandwidth_mbps": 0.02, "rays": 20}, "gate": {"width_m": {"min": 0.9}}},
         {},
@@ -163,7 +128,7 @@ BUDGETS = {
 }
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "32",
     "Constraints that contradict each other: a gate outside bounds, min above max, fewer rays than sensors",
     done="refused before anything is sampled with the smallest conflicting set by name, exit 4",
@@ -194,28 +159,20 @@ class TestContradictions:
         assert conflicts == expected
         assert_smallest(values, FACE, conflicts, **asked)
 
-    @pytest.mark.parametrize("kind", ["file", "budget"])
-    def test_nothing_is_sampled_before(self, kind, monkeypatch):
+    def test_nothing_is_sampled_before(self, monkeypatch):
         def never(*_, **__):
             raise AssertionError("samples were asked for before the constraints")
 
         for step in ("restrict_samples", "pin_samples", "choose_mounts", "fit_groups"):
             monkeypatch.setattr(f"lidardesign.mixture.fit.{step}", never)
         samples = Samples(FACE.sample(10, np.random.default_rng(0)), np.zeros(10), np.zeros(10), FACE)
-        files = [(values, {}) for values, _ in CONTRADICTIONS.values()]
-        for values, asked in files if kind == "file" else [one[:2] for one in BUDGETS.values()]:
+        for values, asked in [
+            *((one[0], {}) for one in CONTRADICTIONS.values()),
+            *(one[:2] for one in BUDGETS.values()),
+        ]:
             with pytest.raises(InfeasibleError) as caught:
                 fitted(samples, values, **asked)
             assert len(caught.value.conflicts) >= 2
-
-    def test_the_command_names_them_exits_4_and_writes_nothing(self, call, tmp_path):
-        run = make_run(tmp_path / "run", 2000)
-        (tmp_path / "c.yaml").write_text("gate: {start_m: {min: 0.8}, end_m: {max: 0.5}}\n")
-        before = files_under(run)
-        result = call("constrain", "run", "--constraints", "c.yaml", "--json")
-        assert result.code == 4
-        assert set(result.json["error"]["conflicts"]) == {"gate.start_m.min", "gate.end_m.max"}
-        assert files_under(run) == before
 
 
 def rare(share, count=20_000):
@@ -230,11 +187,11 @@ NEAR = {"gate": {"end_m": {"max": 0.5}}}
 REGION = {"origin": {"spread_m": {"max": 9.0}}}
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "33",
     "Constraints that leave almost nothing of the density",
-    done="below a thousandth of the mass, or with too few effective samples, the fit is refused with the mass and what "
-    "would do, exit 4; it is measured on samples that exist, once",
+    done="below a thousandth of the mass, or with too few effective samples, the fit is refused with the mass and "
+    "what would do, exit 4",
 )
 class TestAlmostNothingLeft:
     @pytest.mark.parametrize("share", [1e-4, 1e-7, 1e-12, 1e-300])
@@ -246,13 +203,6 @@ class TestAlmostNothingLeft:
         assert f"{share:.3g} of the density" in caught.value.message
         assert caught.value.allowed == f"at least {LEAST_MASS:g}"
         assert caught.value.hint
-
-    def test_without_any_sample_inside_the_mass_is_zero(self):
-        samples = rare(0.5)
-        far = samples.subset(samples.points[:, 5] > 1.0)
-        with pytest.raises(InfeasibleError) as caught:
-            fitted(far, NEAR, sensors=1)
-        assert caught.value.admissible_mass == 0.0
 
     def test_enough_mass_on_too_few_samples_says_how_many_count(self):
         samples = rare(0.5)
@@ -288,132 +238,81 @@ class TestAlmostNothingLeft:
             assert 0 < estimate.error < share
 
     def test_surfaces_that_hardly_any_ray_sees_are_drawn_a_bounded_number_of_times(self, monkeypatch):
-        from lidardesign.errors import DataError
-        from lidardesign.scenes.scene import Body, Scene, Sphere
-        from lidardesign.scoring import metrics
-
         draws = []
         exact = metrics.sample_body
         monkeypatch.setattr(metrics, "sample_body", lambda *a, **k: (draws.append(a[2]), exact(*a, **k))[1])
         away = DesignSpace((3.0, 0, 0, 0.0, -0.1, 0.1), (3.0, 0, 0, 0.1, 0.1, 2.0))
         with pytest.raises(DataError, match="no ray of the design space sees"):
             metrics.visible_surface(Scene((Body(Sphere(0.5)),)), away, 100, np.random.default_rng(0))
-        assert len(draws) <= DRAW_ROUNDS
+        assert len(draws) <= metrics.DRAW_ROUNDS
 
 
-def random_section(generator):
-    """Bounds on one sensor, some of which may contradict each other."""
-
-    def number(low, high):
-        return float(np.round(generator.uniform(low, high), 3))
-
-    def interval(low, high, likely):
-        ends = {"min": number(low, high), "max": max(number(low, high), 1e-3)}
-        return {end: value for end, value in ends.items() if generator.random() < likely}
-
-    def box():
-        corner = [number(-1, 0.5) for _ in range(3)]
-        return {"low_m": corner, "high_m": [value + number(0, 1.2) for value in corner]}
-
-    section = {}
-    if generator.random() < 0.4:
-        keys = {
-            "low_m": lambda: [number(-1, 0.2), number(-1, 0.2), number(0, 0.8)],
-            "high_m": lambda: [number(0, 1), number(0, 1), number(0.7, 2)],
-            "spread_m": lambda: {"max": number(0.001, 0.5)},
-            "thickness_m": lambda: {"max": number(0.001, 0.2)},
-            "exclude": lambda: [box() for _ in range(generator.integers(1, 3))],
-        }
-        section["origin"] = {key: make() for key, make in keys.items() if generator.random() < 0.4}
-    if generator.random() < 0.4:
-        section["boresight"] = {
-            "azimuth_deg": interval(-400, 400, 0.4), "elevation_deg": interval(-80, 80, 0.4),
-        }  # fmt: skip
-    if generator.random() < 0.4:
-        section["field_of_view"] = {f"{axis}_deg": interval(0, 70, 0.4) for axis in ("horizontal", "vertical")}
-    if generator.random() < 0.6:
-        section["gate"] = {
-            "start_m": interval(0, 2, 0.4), "end_m": interval(0.5, 4, 0.4), "width_m": interval(0, 2, 0.4),
-        }  # fmt: skip
-    return section
+def least(low, high):
+    return st.floats(low, high).map(lambda value: {"min": value})
 
 
-def random_file(seed):
-    """A whole constraint file."""
-    generator = np.random.default_rng(seed)
-    values = random_section(generator)
-    values["budget"] = {"rays": int(generator.integers(3, 60))}
-    if generator.random() < 0.5:
-        values["budget"]["bandwidth_mbps"] = float(np.exp(generator.uniform(-5, 3)))
-    values["sensors"] = {"count": int(generator.integers(1, 4))}
-    if generator.random() < 0.25:
-        values["each"] = [
-            random_section(generator) for _ in range(generator.integers(1, values["sensors"]["count"] + 1))
-        ]
-    return values
+def most(low, high):
+    return st.floats(low, high).map(lambda value: {"max": value})
 
 
-def clamp_and_mstep():
-    """Log-likelihoods of ranges: fitted freely, with gates clamped afterwards, and with gates bounded while fitting."""
-    generator = np.random.default_rng(0)
-    points = np.zeros((2000, 6))
-    points[:, 5] = 2.0 + generator.gamma(1.0, 0.2, 2000)
-    space = DesignSpace((0, 0, 0, 0, 0, 0.1), (0, 0, 0, 0, 0, 9.0))
-    features = Features.of(points, np.ones(2000), Axes.of(space), space)
-    start = fit_mixture(features, Bounds.unbounded(2, Z), np.random.default_rng(1))
-    two = Bounds.unbounded(2, Z).narrowed(0.2)
-    clamped = admitted_mixture(start.mixture, features, Bounds.unbounded(2, Z))
-    rows = {name: getattr(clamped, name).copy() for name in clamped.__dataclass_fields__}
-    rows["spread_range_m"] = np.minimum(rows["spread_range_m"], 0.2 / (2 * Z))
-    after = float(features.weights @ log_density(type(clamped)(**rows), features))
-    within = fit_mixture(features, two, np.random.default_rng(1)).log_likelihood
-    return start.log_likelihood, after, within
+def optional(**keys):
+    return st.fixed_dictionaries({}, optional=keys)
 
 
-@hard_case(
+def constraint_files(**origin):
+    """Constraint files that may contradict themselves; `origin` are further keys of origins."""
+    bounds = {
+        "gate": optional(
+            width_m=most(0.05, 1.2), start_m=least(0, 0.6) | most(0.3, 1.0), end_m=most(0.5, 1.5) | least(0.5, 1.2)
+        ),
+        "field_of_view": optional(horizontal_deg=most(2, 90), vertical_deg=most(2, 90)),
+        "boresight": optional(
+            azimuth_deg=st.builds(
+                lambda low, width: {"min": low, "max": low + width}, st.floats(30, 110), st.floats(1, 60)
+            ),
+            elevation_deg=most(-60, 60),
+        ),
+        "origin": optional(spread_m=most(1e-3, 0.3), **origin),
+    }
+    return optional(
+        sensors=st.integers(1, 4).map(lambda count: {"count": count}),
+        budget=st.fixed_dictionaries({"rays": st.integers(1, 60)}, optional={"bandwidth_mbps": st.floats(0.001, 2.0)}),
+        each=st.lists(optional(**bounds), min_size=1, max_size=2),
+        **bounds,
+    )
+
+
+corners = st.lists(st.floats(-1, 0.5), min_size=3, max_size=3)
+boxes = corners.map(lambda low: [{"low_m": low, "high_m": [value + 0.6 for value in low]}])
+
+
+@pytest.mark.hard_case(
     "34",
     "Bounds on gates, fields of view and origins that the free fit breaks",
     done="every M-step is the best one inside the bounds, and the written file is verified bound by bound by a checker "
     "that shares no code with the fit",
 )
 class TestBoundsHoldOnTheWrittenFile:
-    def test_bounds_in_the_m_step_lose_less_than_clamping_after_the_fit(self):
-        free, after, within = clamp_and_mstep()
-        assert free >= within > after + 0.1
-
-    @pytest.mark.parametrize("start", range(0, 40, 5))
-    def test_random_files_are_kept_exactly_or_refused_with_what_stands_against_them(self, start):
-        kept, reasons = 0, []
-        for seed in range(start, start + 5):
-            values = random_file(seed)
-            try:
-                found = fitted(SAMPLES, values, em_samples=1200, restarts=1, retarget=flat)
-            except InfeasibleError as refused:
-                reasons.append(refused.conflicts or refused.admissible_mass or "effective samples" in refused.message)
-                continue
-            document = design_document(design_of(found))
-            for written in (
-                json.loads(json.dumps(document, allow_nan=False)),
-                yaml.safe_load(yaml.safe_dump(document)),
-                design_document(design_from_document(document, "again")),
-            ):
-                assert [check for check in check_design(written, values, ROOM) if not check.satisfied] == []
-            assert found.rays == values["budget"]["rays"]
-            kept += 1
-        assert kept > 0
-        assert all(reasons)
-
-    @pytest.mark.parametrize("mbps", [0.05, 0.2])
-    def test_a_bandwidth_that_narrows_gates_leaves_their_other_bounds(self, mbps):
-        # the start must come early and the end late: narrowing has to stop between
-        values = {
-            "gate": {"start_m": {"max": 1.0}, "end_m": {"min": 1.3}}, "sensors": {"count": 2},
-            "budget": {"bandwidth_mbps": mbps, "rays": 5},
-        }  # fmt: skip
-        if conflicts_of(values, ROOM):
-            assert mbps == 0.05
+    @settings(max_examples=25)
+    @given(constraint_files(low_m=corners, thickness_m=most(1e-3, 0.2), exclude=boxes))
+    def test_any_file_is_kept_exactly_or_refused_with_what_stands_against_it(self, values):
+        try:
+            found = fitted(SAMPLES, values, em_samples=1200, restarts=1, retarget=even)
+        except InfeasibleError as error:
+            refused = error
+        else:
+            refused = None
+        if refused is not None:
+            assert refused.conflicts or refused.admissible_mass or "effective samples" in refused.message
             return
-        assert broken(fitted(SAMPLES, values, retarget=flat), values, ROOM) == []
+        document = design_document(design_of(found))
+        for written in (
+            json.loads(json.dumps(document, allow_nan=False)),
+            yaml.safe_load(yaml.safe_dump(document)),
+            design_document(design_from_document(document, "again")),
+        ):
+            assert [check for check in check_design(written, values, ROOM) if not check.satisfied] == []
+        assert found.rays == values.get("budget", {}).get("rays")
 
     def test_the_checker_shares_no_code_with_the_fit(self):
         # parts have to be looked up, and angles mean what they mean: data and conventions, nothing of the fit
@@ -427,23 +326,13 @@ class TestBoundsHoldOnTheWrittenFile:
 weights = st.lists(st.floats(0, 1e12), min_size=1, max_size=40).filter(lambda values: max(values) > 0)
 
 
-@hard_case(
+@pytest.mark.hard_case(
     "35",
     "A ray budget of 0, of 1, below the number of sensors, or between equal weights",
-    done="largest remainders: the sum is exact, no share is a whole ray off, ties go to the first; a fit gives "
-    "every sensor a ray or is refused",
+    done="largest remainders: the sum is exact, no share is a whole ray off, ties go to the first",
 )
 class TestBudgetsThatDoNotDivide:
-    @given(st.permutations(range(6)), st.integers(0, 400))
-    def test_the_order_of_sensors_matters_only_between_equal_ones(self, order, rays):
-        weights = np.array([0.31, 0.05, 0.17, 0.23, 0.11, 0.13])
-        order = np.array(order)
-        quotas = weights * rays
-        remainders = np.sort(quotas - np.floor(quotas))
-        assume((np.diff(remainders) > 1e-6).all())
-        np.testing.assert_array_equal(split_budget(weights[order], rays), split_budget(weights, rays)[order])
-
-    @pytest.mark.parametrize("rays", [1, 2, 3, 4, 5])
+    @pytest.mark.parametrize("rays", [1, 3])
     def test_a_fit_has_no_more_sensors_than_rays_where_their_number_is_open(self, rays):
         found = fitted(SAMPLES, REGION, rays=rays, em_samples=1200, restarts=1)
         assert len(found.sensors) <= rays == found.rays
@@ -457,12 +346,45 @@ class TestBudgetsThatDoNotDivide:
         if alone.min() > 0:
             np.testing.assert_array_equal(each, alone)
 
-    def test_fewer_rays_than_sensors_that_were_asked_for_are_refused(self):
-        for values, asked in (
-            ({}, {"sensors": 3, "rays": 2}),
-            ({"sensors": {"count": 3}}, {"rays": 2}),
-            ({"each": [{}, {}, {}]}, {"rays": 2}),
-            ({"sensors": {"min": 3}, "budget": {"rays": 2}}, {}),
-        ):
-            with pytest.raises(InfeasibleError, match="2 rays for 3 sensors"):
-                fitted(SAMPLES, values, **asked)
+
+def longer_gates(document):
+    sensors = [{**one, "gate_m": {**one["gate_m"], "end": one["gate_m"]["end"] + 0.01}} for one in document["sensors"]]
+    return {**document, "sensors": sensors}
+
+
+@pytest.mark.hard_case(
+    "P7",
+    "Any constraints",
+    done="the written design satisfies all of them, found by a checker that shares nothing with the fit, or nothing is "
+    "written and the command exits 4",
+)
+class TestDesignsKeepTheirConstraints:
+    @settings(max_examples=6)
+    @given(constraint_files(), st.sampled_from(["even", "chosen"]))
+    def test_the_written_design_satisfies_them_all_or_the_command_exits_4(self, made, rules, layout):
+        folder = made.parent / "tried"
+        shutil.rmtree(folder, ignore_errors=True)
+        shutil.copytree(made, folder)
+        path = made.parent / "rules.yaml"
+        path.write_text(json.dumps(rules))
+        options = ("--layout", layout, *(() if "sensors" in rules else ("--sensors", "2")))
+        with pytest.raises(SystemExit) as ended:
+            run_program(["constrain", str(folder), "--constraints", str(path), *options, "--name", "d", "-q"])
+        written = folder / "designs" / "d.yaml"
+        assert (ended.value.code or 0) in (0, 4)
+        assert written.exists() == (ended.value.code in (0, None))
+        if written.exists():
+            space = DesignSpace.from_dict(load_yaml(folder / "config.yaml").value["space"])
+            checks = check_design(load_yaml(written).value, rules, space)
+            assert checks or not rules
+            assert all(check.satisfied for check in checks), [check.name for check in checks if not check.satisfied]
+
+    def test_a_fit_that_broke_a_constraint_would_be_found_out_on_what_it_writes(self, lidardesign, flat, monkeypatch):
+        dump = fit_design.dump_yaml
+        # as if a gate had been written a little too long
+        monkeypatch.setattr(fit_design, "dump_yaml", lambda document: dump(longer_gates(document)))
+        options = ("--layout", "even", "--sensors", 2, "--set", "gate.width_m.max=0.1", "--name", "never", "--json")
+        done = lidardesign("constrain", flat, *options)
+        assert done.code == 4
+        assert any("gate" in name for name in done.json["error"]["conflicts"])
+        assert not (flat / "designs" / "never.yaml").exists()
