@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import doctest
 import shutil
-from html.parser import HTMLParser
 
 import numpy as np
 import pytest
@@ -82,12 +81,6 @@ def test_a_baseline_as_a_design_scores_as_the_baseline_does(run, name):
     assert again.simulate(rays=16)[0].returns[0].rays.direction.shape == (16, 3)
 
 
-@pytest.mark.parametrize("choice", [{"name": "../x"}, {"name": "x/y"}, {"rays": 0}, {"rays": -3}])
-def test_a_baseline_keeps_to_names_and_numbers_that_designs_have(run, choice):
-    with pytest.raises(ConfigError):
-        run.baseline("uniform", **choice)
-
-
 @pytest.mark.parametrize(("name", "said"), [("random", "no fixed list"), ("cma", "no fixed list"), ("x", "unknown")])
 def test_a_baseline_without_rays_of_its_own_is_not_saved(run, name, said):
     with pytest.raises(ConfigError, match=said) as refused:
@@ -105,25 +98,12 @@ def test_every_noun_has_an_example_that_runs(run, name):
     assert doctest.DocTestRunner().run(examples).failed == 0
 
 
-class Tables(HTMLParser):
-    """Counts the rows of tables."""
-
-    def __init__(self):
-        super().__init__()
-        self.tags = []
-
-    def handle_starttag(self, tag, attrs):
-        self.tags.append(tag)
-
-
 def test_notebooks_show_tables_and_figures(run):
     design = run.fit(layout="even", sensors=2, rays=16, name="a-b")
     scores = run.evaluate([design], rays=[16])
     for noun, rows in ((run, 9), (design, 3), (scores, 7)):
-        page = Tables()
-        page.feed(noun._repr_html_())
-        assert page.tags.count("table") == 1
-        assert page.tags.count("tr") == rows, page.tags
+        page = noun._repr_html_()
+        assert (page.count("<table"), page.count("<tr")) == (1, rows)
     assert len(design.figure(16).data) == 3
     assert {trace.name for trace in scores.figure().data} >= {"a-b", "uniform"}
     assert "bandwidth" in scores.figure("bandwidth").layout.xaxis.title.text.lower()
@@ -196,6 +176,8 @@ def test_the_density_draws_the_same_points_for_the_same_seed(run):
     ("call", "where"),
     [
         (lambda run: run.fit(layout="spiral"), "layout"),
+        (lambda run: run.baseline("uniform", name="../x"), "name"),
+        (lambda run: run.baseline("uniform", rays=0), "rays"),
         (lambda run: run.fit(sensors=2, rays=0), "rays"),
         (lambda run: run.evaluate(baselines=["best"]), "baselines"),
         (lambda run: run.evaluate(baselines=["none", "lloyd"]), "baselines"),
@@ -234,7 +216,6 @@ def test_one_kind_of_progress_says_how_far_everything_has_come(tmp_path):
 
 def test_steps_are_not_counted_down_where_time_decides(tmp_path):
     said = []
-    lidardesign.learn(
-        "flatland", out=tmp_path / "run", settings=SMALL, time_budget_s=1.0, progress=lambda *now: said.append(now)
-    )
+    options = {"settings": SMALL, "time_budget_s": 0.3, "progress": lambda *now: said.append(now)}
+    lidardesign.learn("flatland", out=tmp_path / "run", **options)
     assert all(now[1] > 0 and now[2] is None for now in said)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from rich.console import Console
-from support.command_line import caller, files_under
+from support.command_line import files_under
 
 from lidardesign.cli.terminal.score_tables import show_times
 from lidardesign.run.files import run_lock
@@ -22,10 +22,9 @@ LEARN = (
 
 
 @pytest.fixture
-def lidardesign(capsys, tmp_path, monkeypatch):
-    """Run the program in this process, in an empty folder."""
-    program = caller(capsys, tmp_path, monkeypatch)
-    return lambda line, *more: program(*line.split(), *more)
+def lidardesign(call):
+    """The program with its first words as one line."""
+    return lambda line, *more: call(*line.split(), *more)
 
 
 def adds_up(document):
