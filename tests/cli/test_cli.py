@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rich.console import Console
-from support.command_line import make_run
 
 import lidardesign as package
 from lidardesign import __version__
@@ -28,11 +27,6 @@ from lidardesign.sensors.compare import paired_sensors
 from lidardesign.sensors.design_file import save_design
 
 PART = "vl53l8cx:4x4"
-
-
-@pytest.fixture
-def flat(tmp_path):
-    return make_run(tmp_path / "run")
 
 
 def test_the_versions_that_results_depend_on_are_printed(lidardesign):
@@ -149,13 +143,7 @@ def test_an_error_after_the_document_adds_no_second_one(capsys):
 
 
 def test_numbers_that_json_lacks_become_null():
-    values = {
-        "a": float("nan"),
-        "b": [np.inf, np.float64(1.5)],
-        "c": np.arange(2),
-        "d": Path("x"),
-        "e": (None, True),
-    }
+    values = {"a": np.nan, "b": [np.inf, np.float64(1.5)], "c": np.arange(2), "d": Path("x"), "e": (None, True)}
     assert plain_json(values) == {"a": None, "b": [None, 1.5], "c": [0, 1], "d": "x", "e": [None, True]}
 
 

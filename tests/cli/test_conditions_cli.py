@@ -77,13 +77,12 @@ def test_rays_follow_a_condition_and_are_shown_at_its_values(lidardesign, follow
 
 def test_rays_along_a_condition_score_the_same_where_their_run_is_gone(lidardesign, following, tmp_path):
     (tmp_path / "away.yaml").write_text(following.read_text().replace("name: fit", "name: away"))
-    few = ("--rays", 4, "--set", "test=4", "--baseline", "lloyd")
+    few = ("--rays", 4, "--set", "test=4", "--baseline", "none")
     result = lidardesign("evaluate", following, "away.yaml", *few, "--json")
     assert result.code == 0, result.err
     rows = {row["design"]: row for row in result.json["rows"]}
     for key in ("value", "bandwidth_mbps", "failures"):
         assert rows["away"][key] == rows["fit"][key]
-    assert rows["fit"]["value"] < rows["uniform"]["value"]
 
 
 def test_constraints_hold_along_a_condition_and_at_a_value(lidardesign, run, following):

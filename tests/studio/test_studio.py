@@ -183,7 +183,7 @@ def test_a_field_is_narrowed_fitted_saved_shown_to_mounters_and_scored(studio, r
     studio.wish("save")
     wait_for(robot.design_path("narrow").exists)
     studio.wish("mounts")
-    wait_for(lambda: "wrote" in studio._panel._working.content)
+    wait_for(lambda: [*robot.folder.rglob("mounts.html")])
     studio.wish("step", "Score")
     wait_for(lambda: "held-out scenes, which" in studio._panel.scores.content.replace("*", ""))
     robot.design_path("narrow").unlink()
