@@ -1,4 +1,4 @@
-"""The package's own API: the script of its users, its nouns' examples, and what notebooks show."""
+"""The package's own API: its nouns' examples, and what notebooks show; docs/python.md is run with the other pages."""
 
 from __future__ import annotations
 
@@ -13,25 +13,6 @@ import lidardesign
 from lidardesign.errors import ConfigError, DataError, InfeasibleError
 from lidardesign.samples import load_samples
 
-SCRIPT = """
-import lidardesign as ld
-
-run = ld.learn("face", preset="draft", out="runs/face", seed=0)        # or ld.open_run("runs/face")
-print(run.quality.ess, run.quality.kl_nats)
-points = run.density.sample(1000)                                      # and run.density.log_prob(points)
-
-free = run.fit(sensors=4, layout="even", name="free")
-kept = run.fit(sensors=4, constraints={"gate": {"width_m": {"max": 0.1}}}, rays=196, name="kept")
-best = run.fit(sensors=3, rays=196, gates="ray", name="best")
-best.save(); best.export("rays.csv"); rays = best.rays(196)
-
-scores = run.evaluate([free, kept, best], rays=[196], baselines=["bounding"])
-scores.rows, scores.paired, scores.to_csv("scores.csv"), scores.report("report.html")
-"""
-SMALL_FACE = {
-    "learning.steps": 60, "learning.batch": 128, "learning.samples": 10_000, "density.sigma_m": 0.04,
-    "truth_points": 300, "train": 2, "test": 1,
-}  # fmt: skip
 SMALL = {
     "learning.steps": 60, "learning.batch": 128, "learning.samples": 10_000, "density.sigma_m": 0.05, "train": 3,
     "test": 2,
@@ -50,24 +31,6 @@ def learned(tmp_path_factory):
 def run(learned, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     return lidardesign.open_run(shutil.copytree(learned, tmp_path / "flat"))
-
-
-def test_the_script_of_users_runs_as_it_stands(tmp_path, monkeypatch):
-    learn = lidardesign.learn
-    monkeypatch.setattr(
-        lidardesign, "learn", lambda task, **choices: learn(task, **{**choices, "settings": SMALL_FACE}), raising=False
-    )
-    monkeypatch.chdir(tmp_path)
-    names = {}
-    exec(compile(SCRIPT, "script", "exec"), names)
-    assert names["points"].shape == (1000, 6)
-    assert np.isfinite(names["run"].density.log_prob(names["points"])).all()
-    assert all(check.satisfied for check in names["kept"].result.constraints)
-    assert len(names["rays"]) == 196
-    assert {row.design for row in names["scores"].rows} >= {"free", "kept", "best", "bounding"}
-    for name in ("rays.csv", "scores.csv", "report.html", "runs/face/designs/best.yaml"):
-        assert (tmp_path / name).stat().st_size > 100
-    assert not (tmp_path / "runs" / "face" / "designs" / "free.yaml").exists()
 
 
 @pytest.mark.parametrize("name", ["uniform", "bounding", "greedy"])
@@ -128,6 +91,7 @@ def test_saved_designs_are_those_of_commands(run):
 
 def test_a_design_is_fitted_again_with_what_is_not_chosen_anew(run):
     design = run.fit(sensors=2, rays=16, layout="even", level=0.8, name="first")
+    assert not run.design_path("first").exists()
     again = design.constrain(constraints={"gate": {"width_m": {"max": 0.3}}})
     assert (again.name, again.specification.layout, again.specification.count) == ("constrained", "even", 16)
     assert again.specification.level == 0.8
@@ -216,6 +180,6 @@ def test_one_kind_of_progress_says_how_far_everything_has_come(tmp_path):
 
 def test_steps_are_not_counted_down_where_time_decides(tmp_path):
     said = []
-    options = {"settings": SMALL, "time_budget_s": 0.3, "progress": lambda *now: said.append(now)}
+    options = {"settings": SMALL, "time_budget_s": 1.0, "progress": lambda *now: said.append(now)}
     lidardesign.learn("flatland", out=tmp_path / "run", **options)
     assert all(now[1] > 0 and now[2] is None for now in said)

@@ -19,8 +19,8 @@ from lidardesign.sensors.compare import outside_space
 from lidardesign.sensors.pattern import Pattern
 from lidardesign.space import DIMENSIONS, direction
 
-LAYOUTS = ("even", "chosen")
-OPTIONS = {"rays": [8], "baselines": ["lloyd", "no-visibility"]}
+# Layouts, and further baselines that they are scored beside.
+LAYOUTS = {"even": ["lloyd", "no-visibility"], "chosen": ["occupancy"]}
 
 
 @pytest.fixture(scope="module")
@@ -48,13 +48,13 @@ def without_times(scores):
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_scores_are_those_of_a_run_that_was_learned_there(runs, layout):
     own, other = runs
-    design = own / "designs" / f"{layout}.yaml"
-    there = package.open_run(other).evaluate([design], **OPTIONS)
+    design, options = own / "designs" / f"{layout}.yaml", {"rays": [8], "baselines": LAYOUTS[layout]}
+    there = package.open_run(other).evaluate([design], **options)
     (other / "designs").mkdir()
     shutil.copy(design, other / "designs")
-    at_home = package.open_run(other).evaluate(**OPTIONS)
+    at_home = package.open_run(other).evaluate(**options)
     assert without_times(there) == without_times(at_home)
-    assert len(there.rows) == 8
+    assert len(there.rows) == 6 + len(LAYOUTS[layout])
     elsewhere = package.open_run(own).evaluate([design], rays=[8], baselines=["none"])
     assert there.rows[0].value != elsewhere.rows[0].value
 

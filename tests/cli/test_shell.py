@@ -30,7 +30,7 @@ def fitted(tmp_path_factory):
     """A run with a design."""
     from lidardesign.cli.main import run
 
-    folder = make_run(tmp_path_factory.mktemp("runs") / "flat", count=1000, overrides=["test=4"])
+    folder = make_run(tmp_path_factory.mktemp("runs") / "flat")
     with pytest.raises(SystemExit):
         run(["fit", str(folder), "--layout", "even", "--sensors", "2", "--rays", "9", "--quiet", "--json"])
     return folder
