@@ -30,7 +30,6 @@ LONGEST = (
     "test_hard_fields.py",
     "test_hard_space.py",
     "test_hard_processes.py",
-    "test_hard_plugins.py",
     "test_cluster.py",
     "test_worker_processes.py",
 )

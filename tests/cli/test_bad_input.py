@@ -718,20 +718,16 @@ EXCLUDING = [
     *((f"config schema {kind} --task face", "--task", "config") for kind in ("constraints", "design", "evaluate")),
     ("show run --at x_m=1", "--at", "run"),
     ("show run --in run", "--in", "run"),
-]
-# Those whose message names one of them alone.
-HALF_NAMED = [
     ("fit run --adaptive 2 --survive 1 --sensors 2", "--adaptive", "survive"),
     ("fit run --sensors best --layout spinning", "--sensors", "layout"),
     (f"fit run {PARTS} --channels 4", "--channels", "parts"),
     ("evaluate run --baseline none --fail-unless-better greedy", "--baseline", "--fail-unless-better"),
     ("learn flatland --tolerance 0.1 --set learning.misplaced=0.2", "learning.misplaced", "--tolerance"),
 ]
-NOT_YET = pytest.mark.xfail(strict=True, raises=AssertionError)
-PAIRS = EXCLUDING + [pytest.param(*row, marks=NOT_YET) for row in HALF_NAMED]
+# Those whose message names one of them alone.
 
 
-@pytest.mark.parametrize(("line", "one", "other"), PAIRS)
+@pytest.mark.parametrize(("line", "one", "other"), EXCLUDING)
 def test_options_that_exclude_each_other_are_named_both(place, ready, line, one, other):
     before = state_of(place)
     result = ready(*shlex.split(line), "--json")
