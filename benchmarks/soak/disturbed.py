@@ -5,10 +5,11 @@ from __future__ import annotations
 import csv
 import json
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
-from faults.processes import forked, fresh
+from benchmarks.soak.forks import Fork, import_all
 from lidardesign.density.training.checkpoint import load_arrays
 from lidardesign.errors import LidardesignError
 from lidardesign.formats.designs import load_design
@@ -25,40 +26,49 @@ SETTINGS = (
 )  # fmt: skip
 LEARN = ["learn", "flatland", "--preset", "draft", "--out", "run", "--seed", "3", "--quiet"]
 LEARN += [word for setting in SETTINGS for word in ("--set", setting)]
-# All steps are not enough: exit 1, with a run that is whole.
-TO_TOLERANCE = [*LEARN, "--tolerance", "0.01"]
-FINISHED = (0, 1)
-# Of evaluate, what shows how long things took.
-TIMES = ("manifest.json", "page.html")
-COMMANDS = {
-    "learn": LEARN,
-    "fit": ["fit", "run", "--sensors", "2", "--rays", "8", "--quiet"],
-    # half of its time it writes
-    "evaluate": ["evaluate", "run", "--rays", "8", "--csv", "run/rows.csv", "--report", "run/page.html",
-                 "--quiet"],
-}  # fmt: skip
+FIT = ["fit", "run", "--sensors", "2", "--rays", "8", "--quiet"]
+# half of its time it writes
+EVALUATE = ["evaluate", "run", "--rays", "8", "--csv", "run/rows.csv", "--report", "run/page.html", "--quiet"]
 STATE = "checkpoint.safetensors"
 SAMPLES = "samples.npz"
+# Of evaluate, what shows how long things took.
+TIMES = ("manifest.json", "page.html")
+
+
+@dataclass(frozen=True)
+class Command:
+    """What is given, and after which other command."""
+
+    arguments: list[str]
+    after: str = "nothing"
+
+
+COMMANDS = {
+    "learn": Command(LEARN),
+    "learn --tolerance": Command([*LEARN, "--tolerance", "0.01"]),
+    "fit": Command(FIT, "learn"),
+    "evaluate": Command(EVALUATE, "fit"),
+}
+# With a tolerance all steps are not enough: exit 1, with a run that is whole.
+FINISHED = (0, 1)
 
 
 class Straight:
-    """The run that nobody disturbed, `run` inside of a folder, by commands one after the other, with their names."""
+    """The run that nobody disturbed: `run` inside of a folder for each command, and how that ended."""
 
-    def __init__(self, folder: Path, commands: Mapping[str, list[str]]) -> None:
-        self.folder, self.commands, self.before, self.forks, self.after = folder, commands, {}, {}, {}
-        folder.mkdir()
-        for name, arguments in commands.items():
-            self.before[name] = folder.with_name(f"{folder.name} before {name}")
-            shutil.copytree(folder, self.before[name])
-            ended = forked(arguments, folder)
+    def __init__(self, folder: Path) -> None:
+        import_all()
+        self._folder, self.ends, self.after = folder, {}, {}
+        (folder / "nothing").mkdir()
+        for name, command in COMMANDS.items():
+            ended = Fork(command.arguments, self.before(name, folder / name)).ended()
             if ended.code not in FINISHED:
                 raise SystemExit(f"{name} failed undisturbed: {ended.said}")
-            self.forks[name], self.after[name] = ended, contents(folder / "run")
+            self.ends[name], self.after[name] = ended, contents(folder / name / "run")
 
-    def measure_fresh(self, folder: Path) -> dict[str, float]:
-        """Seconds of each command in a process of its own."""
-        copies = {name: shutil.copytree(self.before[name], folder / f"timed {name}") for name in self.commands}
-        return {name: fresh(self.commands[name], copy).seconds for name, copy in copies.items()}
+    def before(self, name: str, place: Path) -> Path:
+        """Make a place what the folder was before a command."""
+        return shutil.copytree(self._folder / COMMANDS[name].after, place)
 
 
 def contents(run: Path) -> dict[str, object]:

@@ -1,4 +1,4 @@
-"""The program in processes that are killed: forks of this one, which has imported everything, or fresh ones."""
+"""The program in processes that are killed: forks of this one, which has imported everything."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import importlib
 import os
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
 import time
@@ -27,7 +26,6 @@ LATE = (
 )  # fmt: skip
 # Every step by which files come, change their names and go: what is on the disk changes only here.
 STEPS = ("fsync", "link", "mkdir", "replace", "rmdir", "unlink")
-LONGEST_S = 600.0
 # What a fork leaves beside its work.
 SAID, COUNTED = "said", "steps"
 
@@ -54,14 +52,12 @@ def import_all() -> None:
 class Fork:
     """The program in a fork, in a folder, sent a signal before the step of a number from 1, if one is given."""
 
-    def __init__(
-        self, arguments: Sequence[str], folder: Path, at_step: int = 0, at_step_sent: int = signal.SIGKILL
-    ) -> None:
+    def __init__(self, arguments: Sequence[str], folder: Path, step: int = 0, sent: int = signal.SIGKILL) -> None:
         self._started = time.monotonic()
         self._notes = Path(tempfile.mkdtemp())
         self._pid = os.fork()
         if self._pid == 0:
-            _be_the_program(arguments, folder, self._notes, at_step, at_step_sent)
+            _be_the_program(arguments, folder, self._notes, step, sent)
 
     def ended(self, after_s: float = 0.0, sent: int = signal.SIGKILL) -> Ended:
         """How it ended; with a time, it is sent a signal then unless it has ended before."""
@@ -82,35 +78,16 @@ class Fork:
         return os.waitpid(self._pid, 0)[1]
 
 
-def forked(arguments: Sequence[str], folder: Path, *, at_step: int = 0, sent: int = signal.SIGKILL) -> Ended:
-    """Run the program in a fork; before the step of a number it sends itself a signal."""
-    return Fork(arguments, folder, at_step, sent).ended()
-
-
-def fresh(arguments: Sequence[str], folder: Path, *, after_s: float = 0.0, sent: int = 9) -> Ended:
-    """Run the program in a process of its own, as a user does; arguments as of `forked`."""
-    started = time.monotonic()
-    process = subprocess.Popen(
-        [sys.executable, "-m", "lidardesign", *arguments],
-        cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    with contextlib.suppress(subprocess.TimeoutExpired):
-        _, said = process.communicate(timeout=after_s or LONGEST_S)
-        return Ended(process.returncode, time.monotonic() - started, said)
-    process.send_signal(sent)
-    _, said = process.communicate(timeout=LONGEST_S)
-    return Ended(process.returncode, time.monotonic() - started, said)
-
-
-def _be_the_program(arguments: Sequence[str], folder: Path, notes: Path, at_step: int, sent: int) -> None:
+def _be_the_program(arguments: Sequence[str], folder: Path, notes: Path, step: int, sent: int) -> None:
     """Never returns: whatever happens ends the fork and not what it was forked from."""
     code = 99
     try:
         os.chdir(folder)
         for stream, path in ((1, os.devnull), (2, notes / SAID)):
             os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), stream)
+        sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w")
         signal.signal(signal.SIGINT, signal.default_int_handler)
-        _count_steps(notes / COUNTED, at_step, sent)
+        _count_steps(notes / COUNTED, step, sent)
         from lidardesign.cli.main import run
 
         run(list(arguments))
