@@ -1,10 +1,10 @@
 """Kills of learn, fit and evaluate, `make soak-kills`: what is left can be read, and going on gives the same bytes.
 
-A fork is sent SIGKILL or SIGTERM before one of the steps by which files change, or after a random time. Then every file
-that is there must be readable, the command given again (`learn` with --resume) must end well and leave no temporary file
-and no lock, and the bytes of flow, samples, snapshots, checkpoint, designs and tables must be those of a run that nobody
-disturbed, but for the seconds in them. Of two commands at once in one folder one must work, and the other must work or
-be told why not.
+A fork is sent SIGKILL or SIGTERM before one of the steps by which files change, or after a random time. Then every
+file that is there must be readable, the command given again (`learn` with --resume) must end well and leave no lock and
+no temporary file, and the bytes of flow, samples, snapshots, checkpoint, designs and tables must be those of a run that
+nobody disturbed, but for the seconds in them. Of two commands at once in one folder one must work, and the other must
+work or be told why not.
 """
 
 from __future__ import annotations
@@ -22,32 +22,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.soak.disturbed import (
-    COMMANDS,
-    EVALUATE,
-    FINISHED,
-    FIT,
-    LEARN,
-    Straight,
-    contents,
-    strays,
-    unreadable,
-)  # fmt: skip
-from benchmarks.soak.forks import Ended, Fork
+from benchmarks.soak.disturbed import COMMANDS, FINISHED, LEARN, Ended, Fork, Straight, contents, strays, unreadable
 from benchmarks.soak.long_runs import amount
 
 # Commands that are given at once, in a folder as it was before one of them.
-RESUME = [*LEARN, "--resume"]
+GIVEN = {**{name: command.arguments for name, command in COMMANDS.items()}, "learn --resume": [*LEARN, "--resume"]}
 PAIRS = {
-    "learn and learn": ("learn", LEARN, LEARN),
-    "learn and learn --resume": ("learn", LEARN, RESUME),
-    "learn and fit": ("learn", LEARN, FIT),
-    "learn --resume twice": ("fit", RESUME, RESUME),
-    "learn --resume and fit": ("fit", RESUME, FIT),
-    "fit and fit": ("fit", FIT, FIT),
-    "evaluate and evaluate": ("evaluate", EVALUATE, EVALUATE),
-    "evaluate and fit": ("evaluate", EVALUATE, FIT),
-}
+    f"{first} and {second}": (before, first, second)
+    for before, first, second in (
+        ("learn", "learn", "learn"), ("learn", "learn", "learn --resume"), ("learn", "learn", "fit"),
+        ("fit", "learn --resume", "learn --resume"), ("fit", "learn --resume", "fit"), ("fit", "fit", "fit"),
+        ("evaluate", "evaluate", "evaluate"), ("evaluate", "evaluate", "fit"),
+    )
+}  # fmt: skip
 REFUSED = (2, 3)
 LONGEST_DELAY_S = 2.0
 TERMINATED = 143
@@ -102,10 +89,10 @@ def ended_early(
     straight.before(name, place)
     if where == "step":  # every one of them, in as many rounds
         step = int(np.random.default_rng(0).permutation(whole.steps)[number % whole.steps]) + 1
-        told, ended = f"step {step}", Fork(COMMANDS[name].arguments, place, step, sign).ended()
+        told, ended = f"step {step}", Fork(GIVEN[name], place, step, sign).ended()
     else:
         after_s = np.random.default_rng([zlib.crc32(f"{sent} {name}".encode()), number]).uniform(0, whole.seconds)
-        told, ended = f"after {after_s:.3f} s", Fork(COMMANDS[name].arguments, place).ended(after_s, sign)
+        told, ended = f"after {after_s:.3f} s", Fork(GIVEN[name], place).ended(after_s, sign)
     return ended.code not in FINISHED, told, [*_left(where, sent, ended, place), *_again(straight, name, place)]
 
 
@@ -123,7 +110,7 @@ def _left(where: str, sent: str, ended: Ended, place: Path) -> Iterator[str]:
 
 def _again(straight: Straight, name: str, place: Path) -> Iterator[str]:
     """What is wrong with the folder after the command was given again."""
-    arguments = list(COMMANDS[name].arguments)
+    arguments = list(GIVEN[name])
     if arguments[0] == "learn" and (place / "run").exists():
         arguments.append("--resume")
     ended = Fork(arguments, place).ended()
@@ -143,9 +130,9 @@ def at_once(straight: Straight, name: str, number: int, place: Path) -> tuple[bo
     # the first time really at once
     delay_s = np.random.default_rng([zlib.crc32(name.encode()), number]).uniform(0, LONGEST_DELAY_S) if number else 0.0
     straight.before(before, place)
-    one = Fork(first, place)
+    one = Fork(GIVEN[first], place)
     time.sleep(delay_s)
-    other = Fork(second, place)
+    other = Fork(GIVEN[second], place)
     ends = [one.ended(), other.ended()]
     faults = [] if any(end.code == 0 for end in ends) else ["neither worked"]
     for end in ends:

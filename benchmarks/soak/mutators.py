@@ -204,10 +204,6 @@ def _dump_yaml(document: object, source: random.Random) -> bytes:
     return yaml.dump(document, Dumper=Dumper, sort_keys=False, default_flow_style=source.random() < 0.5).encode()
 
 
-def _dump_json(document: object, _: random.Random) -> bytes:
-    return json.dumps(document).encode()
-
-
 def unpacked(content: bytes) -> dict[str, bytes]:
     """The files of an archive."""
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -221,10 +217,6 @@ def packed(files: dict[str, bytes], compression: int = zipfile.ZIP_STORED) -> by
         for name, content in files.items():
             archive.writestr(name or "x", content)
     return buffer.getvalue()
-
-
-def _load_arrays(content: bytes) -> object:
-    return dict(np.load(io.BytesIO(content), allow_pickle=False))
 
 
 def _dump_arrays(arrays: dict[str, object], source: random.Random) -> bytes:
@@ -284,10 +276,8 @@ def _dump_hdf5(tree: dict[str, object], _: random.Random) -> bytes:
     with h5py.File(buffer, "w") as file:
         for key in sorted(tree):
             (place, _, name), value = key.partition("@"), tree[key]
-            if name and place in file:
-                file[place].attrs[name] = value
-            elif name:
-                file.require_group(place).attrs[name] = value
+            if name:
+                (file[place] if place in file else file.require_group(place)).attrs[name] = value
             elif isinstance(value, dict):
                 file.create_dataset(place, **value)
             else:
@@ -341,8 +331,11 @@ def _recorded(files: dict[str, bytes]) -> dict[str, bytes]:
 
 
 mutate_yaml = _of_tree(lambda content: yaml.load(content, Loader=Loader), _dump_yaml, mutate_text)
-mutate_json = _of_tree(json.loads, _dump_json, mutate_text)
-mutate_npz = either(_of_tree(_load_arrays, _dump_arrays), _of_tree(_load_members, _dump_members))
+mutate_json = _of_tree(json.loads, lambda document, _: json.dumps(document).encode(), mutate_text)
+mutate_npz = either(
+    _of_tree(lambda content: dict(np.load(io.BytesIO(content), allow_pickle=False)), _dump_arrays),
+    _of_tree(_load_members, _dump_members),
+)
 mutate_hdf5 = _of_tree(_load_hdf5, _dump_hdf5, values=HDF5_VALUES)
 mutate_safetensors = _of_tree(_load_safetensors, _dump_safetensors)
 mutate_glb = _of_tree(_load_glb, _dump_glb)

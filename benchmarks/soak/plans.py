@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.soak.scaled_flatland import NAME, ScaledFlatlandConfig, ScaledFlatlandTask
-from lidardesign.scenes.scene import Body, Capsule, Scene
+from lidardesign.scenes.scene import Body, Capsule
 from lidardesign.space import DIMENSIONS, DesignSpace, observed_point
 from lidardesign.task import random_generator
 
@@ -212,13 +212,9 @@ def share_near_targets(plan: RunPlan) -> float:
     config = ScaledFlatlandConfig.model_validate(plan.config["task"])
     scenes = ScaledFlatlandTask().scenes(config, "train", plan.seed, space)
     points = observed_point(space.sample(POINTS, random_generator(plan.seed, "soak", "sight")))
-    near = NEAR_SIGMAS * plan.config["density"]["sigma_m"]
-    return float(np.any([distance_to_targets(scene, points) < near for scene in scenes], axis=0).mean())
-
-
-def distance_to_targets(scene: Scene, points: np.ndarray) -> np.ndarray:
-    """Distances of points (N, 3) from the surface of the nearest target, shape (N,) [m]."""
-    return np.min([np.abs(_signed_distance(body, points)) for body in scene.bodies if body.is_target], axis=0)
+    near_m = NEAR_SIGMAS * plan.config["density"]["sigma_m"]
+    targets = [body for scene in scenes for body in scene.bodies if body.is_target]
+    return float(np.any([np.abs(_signed_distance(body, points)) < near_m for body in targets], axis=0).mean())
 
 
 def _signed_distance(body: Body, points: np.ndarray) -> np.ndarray:

@@ -45,7 +45,7 @@ TOLD_NOTHING = "tells anything"
 TOO_ROUGH_WORDS = re.compile(f"the density is too rough|samples count as only|effective samples|{TOLD_NOTHING}")
 NOTHING_SEEN_WORDS = "no ray of the design space reaches a target surface"
 # Outcomes: all four commands did their work; the two refusals that learning may end with.
-WHOLE, ROUGH, BLIND, FAULT = "whole", "density too rough", "nothing in sight", "a fault"
+WHOLE, ROUGH, BLIND = "whole", "density too rough", "nothing in sight"
 # A run may say that it sees nothing where less of its space than this is near any target.
 MOST_NEAR = 1e-3
 # What differs between two runs of one seed: times (also `planning_seconds`) and memory.
@@ -56,11 +56,10 @@ CONTRADICTORY_SHARE = 0.5
 
 @dataclass
 class Record:
-    """What one run did: commands with what was asked and exit codes, bounds read back, digests of what repeats."""
+    """What one run did: how it ended, bounds read back and how constraints ended, and digests of what repeats."""
 
     outcome: str = WHOLE
-    steps: list[tuple[str, str, int]] = field(default_factory=list)
-    bounds: int = 0
+    counts: Counter[str] = field(default_factory=Counter)
     faults: list[str] = field(default_factory=list)
     digests: dict[str, str] = field(default_factory=dict)
 
@@ -116,7 +115,7 @@ class _Doing:
         self._expect(code == DONE, f"learn ended with {code}: {_message(found)}", stop=True)
         for key in ("ess", "coverage", "misplaced"):
             self._expect(0 <= found[key] <= 1, f"learn: {key} is {found[key]}")
-        self._expect(found["kl_nats"] is not None, "learn: there is no estimate of the KL")
+        self._expect(None not in (found["kl_nats"], found["log_z"]), "learn: the KL or log Z is not estimated")
         with np.load("run/samples.npz", allow_pickle=False) as samples:
             for name in ("points", "log_prob", "log_target"):
                 self._expect(bool(np.isfinite(samples[name]).all()), f"learn: {name} of samples.npz is not finite")
@@ -170,7 +169,7 @@ class _Doing:
         """The written file by the independent checker: bounds, shares and numbers."""
         design = _read(name)
         checks = check_design(design, rules, self.space)
-        self.record.bounds += len(checks)
+        self.record.counts["bounds read back"] += len(checks)
         for check in checks:
             self._expect(check.satisfied, f"{name}.yaml breaks {check.name} {check.bound}: found {check.value}")
         self._expect(not not_finite(design), f"{name}.yaml: {not_finite(design)}")
@@ -190,9 +189,7 @@ class _Doing:
             # a single group of scenes has no interval, and that of a few is not cut at the worst value
             if found["groups"] > 1 and value is not None:
                 low, high = row["ci_low"], row["ci_high"]
-                self._expect(
-                    low <= value + slack <= high + 2 * slack, f"evaluate: {what}: {low} to {high}, not {value}"
-                )
+                self._expect(low <= value + slack <= high + 2 * slack, f"evaluate: {what}: {value}, {low} to {high}")
 
     def _call(self, command: str, asked: str, *arguments: str) -> tuple[int, dict[str, Any]]:
         """A command's exit code and document; what it warned of is a fault."""
@@ -201,7 +198,8 @@ class _Doing:
             ran = in_process([command, *arguments, "--json"])
         if ran.code in INTERRUPTED:
             raise KeyboardInterrupt
-        self.record.steps.append((command, asked, ran.code))
+        if command == "constrain":
+            self.record.counts[f"{asked} {'kept' if ran.code == DONE else f'refused with {ran.code}'}"] += 1
         for warning in warned:
             if issubclass(warning.category, RuntimeWarning):
                 line = f"{Path(warning.filename).name}:{warning.lineno}"
@@ -258,18 +256,8 @@ def test_a_random_run_is_without_fault_and_repeats(tmp_path, monkeypatch, piece,
         with ended_after(LONGEST_RUN_S):
             record, again = (whole_run(plan, tmp_path / name) for name in ("run", "again"))
         record.faults += [f"a second run did not repeat {name}" for name in record.differences(again)]
-        ends = {DONE: "kept", INFEASIBLE: "refused"}
-        constrained = [
-            f"{asked} {ends.get(code, f'exit {code}')}" for name, asked, code in record.steps if name == "constrain"
-        ]
-        counts = {"bounds read back": record.bounds, **Counter(sorted(constrained))}
         figures = {"width [m]": plan.size_m, "sigma by width": plan.sigma_share, "free dimensions": len(plan.free)}
-        case = FAULT if record.faults else record.outcome
-        return {
-            "case": case,
-            "counts": counts,
-            "figures": {**figures, "sensors": plan.sensors},
-            "faults": record.faults,
-        }
+        figures["sensors"] = plan.sensors
+        return {"case": record.outcome, "counts": record.counts, "figures": figures, "faults": record.faults}
 
     piece(work)

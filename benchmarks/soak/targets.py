@@ -104,10 +104,10 @@ def read_design(path: Path) -> object:
     return design, [design.rays(count, at) for at in ends]
 
 
-def _own(place: str, look: Callable = lambda found: found) -> Callable[[Path], object]:
+def _own(place: str, look: Callable = lambda found: found, *further: object) -> Callable[[Path], object]:
     """A function of the program, imported when it is called, and what is then looked at."""
     module, name = place.split(":")
-    return lambda path: look(getattr(importlib.import_module(module), name)(path))
+    return lambda path: look(getattr(importlib.import_module(module), name)(path, *further))
 
 
 read_detector = _own("lidardesign.simulate.detector.files:load_detector")
@@ -124,17 +124,10 @@ read_poses = _own(
     "lidardesign_tasks.poses:read_poses",
     lambda paths: {name: (one.time_s, one.at(np.linspace(-1.0, 3.0, 5))) for name, one in paths.items()},
 )
-read_part = _own(
-    "lidardesign.parts.catalogue:find_part", lambda part: part.as_dict() if hasattr(part, "as_dict") else part
-)
-
-
-def read_robot(path: Path) -> object:
-    """As the task arm does."""
-    from lidardesign_tasks.robot.arm_robot import load_robot
-
-    robot = load_robot(path, 0.15)
-    return robot.home_rad, robot.links
+read_part = _own("lidardesign.parts.catalogue:find_part")
+read_robot = _own(
+    "lidardesign_tasks.robot.arm_robot:load_robot", lambda robot: (robot.home_rad, robot.links), 0.15
+)  # fmt: skip
 
 
 def open_recordings(suffix: str) -> Callable[[Path], Read]:
@@ -303,15 +296,11 @@ COMMANDS = tuple(
         ("show DESIGN", 30, DESIGNS, mutate_yaml, "show input.yaml --json"),
         ("export DESIGN", 50, DESIGNS, mutate_yaml,
          "export input.yaml --format csv --out input_out/rays.csv --json"),
-        ("export TABLE", 30, corpus.sensor_tables, TEXTS,
-         "export input.csv --format galvo --rays 20 --json", "input.csv"),
         ("constrain --constraints", 50, corpus.constraint_files, mutate_yaml, CONSTRAIN),
         ("evaluate --detector", 40, corpus.detectors, mutate_yaml,
          "evaluate good.yaml --in run --detector input.yaml --rays 20 --json"),
         ("capture FILE", 30, corpus.captures_npz, mutate_npz,
          "capture input.npz good.yaml --rays 20 --json", "input.npz"),
-        ("capture LIST", 30, corpus.steering_lists, TEXTS,
-         "capture good.npz input.galvo.csv --within-deg 90 --json", "input.galvo.csv"),
         ("learn --config", 30, corpus.configurations, mutate_yaml, "learn flatland --config input.yaml --json"),
         ("learn meshes", 35, corpus.meshes("glb"), mutate_glb, LEARN_MESHES, "input_folder/input.glb"),
         ("learn mujoco", 20, corpus.models, TEXTS, LEARN_MUJOCO, "input.xml"),
@@ -323,7 +312,6 @@ COMMANDS = tuple(
          "fit input_run --layout even --json --name made", "input_run"),
         ("fit --like RIG", 40, corpus.rigs("mjcf"), TEXTS,
          "fit run --like input.xml --layout even --name made --json", "input.xml"),
-        ("catalog show PART", 20, corpus.part_files, mutate_yaml, "catalog show input.yaml --json"),
     )
 )  # fmt: skip
 EVERY = {target.name: target for target in (*TARGETS, *COMMANDS)}
