@@ -136,7 +136,7 @@ def _tables(pieces: Sequence[dict[str, Any]]) -> Iterator[str]:
     rows = [
         (case, *(sum(one.get("counts", {}).get(name, 0) for one in own) for name in names), len(own),
          sum(bool(one["faults"]) for one in own))
-        for case, own in sorted([*cases.items(), *([("together", pieces)] if len(cases) > 1 else [])])
+        for case, own in [*sorted(cases.items()), *([("together", pieces)] if len(cases) > 1 else [])]
     ]  # fmt: skip
     yield table(("", *names, "pieces", "pieces with faults"), rows)
     rows = []
