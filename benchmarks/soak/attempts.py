@@ -74,18 +74,8 @@ def of_file(suffix: str, read: Callable[[Path], object]) -> Callable[[Path], Rea
     return opened
 
 
-@dataclass(frozen=True)
-class Attempt:
-    """What came of reading one content: whether it was `read` or `refused`, the line at which it ended, a fault."""
-
-    how: str
-    place: str
-    fault: str | None
-    seconds: float
-
-
-def attempt(read: Read, content: bytes, slow_s: float) -> Attempt:
-    """Read one content, in so much processor time [s]."""
+def attempt(read: Read, content: bytes, slow_s: float) -> tuple[str, str, str | None]:
+    """Read one content in so much processor time [s]: whether it was `read` or `refused`, the line, and a fault."""
     before, how = time.process_time(), "ended otherwise"
     try:
         with warnings.catch_warnings():
@@ -103,7 +93,7 @@ def attempt(read: Read, content: bytes, slow_s: float) -> Attempt:
     seconds = time.process_time() - before
     if fault is None and seconds > slow_s:
         fault = f"took {seconds:.1f} s of processor time"
-    return Attempt(how, place, fault, seconds)
+    return how, place, fault
 
 
 def _place(error: BaseException) -> str:
@@ -162,7 +152,7 @@ class Fuzzer:
             part.mkdir(parents=True)
         self.seeds = target.seeds(folder / "seeds")
         self._good, self._places = list(self.seeds), set()
-        self.ends, self.slowest_s = Counter(), 0.0
+        self.ends: Counter[str] = Counter()
         with contextlib.chdir(self.work):
             self.read = target.opened(self.work)
         self.present = set(os.listdir(self.work))
@@ -175,14 +165,13 @@ class Fuzzer:
     def run(self, content: bytes) -> str | None:
         """Read a content, in a folder of its own; what fault it found."""
         with contextlib.chdir(self.work):
-            ended = attempt(self.read, content, self.target.slow_s)
-        self.ends[ended.how] += 1
-        self.slowest_s = max(self.slowest_s, ended.seconds)
-        new = ended.place not in self._places or (ended.how == "read" and self.source.random() < KEPT_SHARE)
+            how, place, fault = attempt(self.read, content, self.target.slow_s)
+        self.ends[how] += 1
+        new = place not in self._places or (how == "read" and self.source.random() < KEPT_SHARE)
         if new and len(self.seeds) < MOST_SEEDS:
-            self._places.add(ended.place)
+            self._places.add(place)
             self.seeds.append(content)
-        return ended.fault or self._left_behind()
+        return fault or self._left_behind()
 
     def _left_behind(self) -> str | None:
         """Files that only reading has made: whatever they are, reading must make none."""

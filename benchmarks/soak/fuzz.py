@@ -62,8 +62,7 @@ def read_batch(target: Target, inputs: int, seed: int, folder: Path, found: Path
                 faults.append(f"{path}: {fault}")
     current.unlink()
     counts = {"damaged files": inputs, **{how: fuzzer.ends[how] for how in ("read", "refused")}}
-    figures = {"slowest [s]": fuzzer.slowest_s}
-    return {"case": target.name, "counts": counts, "figures": figures, "faults": faults}
+    return {"case": "files" if target in TARGETS else "whole commands", "counts": counts, "faults": faults}
 
 
 @contextlib.contextmanager

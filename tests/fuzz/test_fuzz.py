@@ -70,7 +70,7 @@ FAULTS = {
 
 @pytest.mark.parametrize("words", FAULTS)
 def test_a_fault_is_found(words):
-    assert words in attempt(FAULTS[words], b"", 1e-3 if words == "processor time" else 10.0).fault
+    assert words in attempt(FAULTS[words], b"", 1e-3 if words == "processor time" else 10.0)[2]
 
 
 def test_a_file_that_reading_leaves_behind_is_found(tmp_path):
