@@ -3,7 +3,7 @@
 Each effect's `bound` (`simulate.effects`) is an upper bound of its change. The smallest are skipped while their sum
 stays within a tolerance: errors of range add up in the worst case, and so do shares of returns. The tolerance holds for
 reported returns, with rounding and photon noise, ray by ray with the same random numbers (`add_quantisation_bounds`;
-tests/soak/promise.py tests it). Effects that are absent from a scene are ruled out without casting a ray.
+benchmarks/soak/promise.py tests it). Effects that are absent from a scene are ruled out without casting a ray.
 
 The time of an effect is predicted per ray and frame, as measured on one core (2.5 GHz) with a face of 20,000 triangles,
 some hundred photons per ray and a gate of 1 m, each effect added to photon noise alone. Elsewhere the relation between

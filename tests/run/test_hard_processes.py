@@ -29,23 +29,6 @@ TINY = (
     "learning.samples=1000", "learning.balance_proposals=256", "learning.coverage_proposals=256",
 )  # fmt: skip
 GONE = 2**22 + 1  # beyond the largest process id that Linux gives
-# Each command is killed in the middle of its steps, on few scenes, as all tests.
-KILLS = """
-import importlib, sys
-from pathlib import Path
-from conftest import SMALL
-from faults.kills import Killing, Tally, at_steps
-from faults.processes import import_all
-from faults.runs import COMMANDS, Straight
-for name, (number, modules) in SMALL.items():
-    for module in modules.split():
-        setattr(importlib.import_module(f"lidardesign.{module}"), name, number)
-import_all()
-folder, tally = Path(sys.argv[1]), Tally(0)
-at_steps(Killing(folder, Straight(folder / "straight", COMMANDS), tally), 1)
-assert not tally.faults, tally.faults
-assert tally.early["step"] == 3
-"""
 
 
 @pytest.fixture
@@ -173,12 +156,14 @@ class TestKillsFullDisksAndTwoWriters:
     )
     @pytest.mark.slow
     def test_kills_at_steps_spread_over_learn_fit_and_evaluate_are_all_recovered(self, tmp_path):
-        tests = str(Path(__file__).parents[1])
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join([tests, os.environ.get("PYTHONPATH", "")])}
-        environment["LONG_RUNS"] = str(tmp_path / "kept")  # what was done before does not count
-        command = [sys.executable, "-c", KILLS, str(tmp_path)]
-        ended = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
-        assert ended.returncode == 0, ended.stderr
+        environment = {**os.environ, "LONG_RUNS": str(tmp_path)}  # what was done before does not count
+        options = "-p benchmarks.soak.long_runs -p no:cacheprovider -m long benchmarks/soak/kills.py --amount 8"
+        ended = subprocess.run(
+            [sys.executable, "-m", "pytest", *options.split()],
+            cwd=Path(__file__).parents[2], env=environment, capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        assert ended.returncode == 0, ended.stdout + ended.stderr
+        assert "8 passed" in ended.stdout
 
 
 TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"

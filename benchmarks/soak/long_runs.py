@@ -1,20 +1,21 @@
 """Long runs as tests marked `long`: what is done is kept, what hangs is ended, and a dated page says what came of it.
 
-A plugin of pytest, for `-p support.long_runs` with tests/ on PYTHONPATH (see the Makefile). xdist goes on behind a
-process that crashed. Every finished piece is a file in `build/long`, in a folder of the program that it is of: the
-commit, and what was changed since. LONG_RUNS in the environment names another folder.
+A plugin of pytest, for `-p benchmarks.soak.long_runs` (see the Makefile). xdist goes on behind a process that crashed.
+Every finished piece is a file in `build/long`, in a folder of the program that it is of: the commit, and what was
+changed since. LONG_RUNS in the environment names another folder.
 """
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import datetime
 import faulthandler
 import hashlib
-import importlib
 import json
 import os
 import platform
+import statistics
 import subprocess
 import textwrap
 import time
@@ -26,7 +27,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDER = Path(os.environ.get("LONG_RUNS", ROOT / "build" / "long"))
-SOURCES = ("lidardesign", "tasks", "tests", "tools")
+SOURCES = ("lidardesign", "tasks", "tests", "tools", "benchmarks")
 WIDTH = 120
 
 
@@ -76,7 +77,10 @@ def ended_after(seconds: float) -> Iterator[None]:
 
 @pytest.fixture
 def piece(request, record_property):
-    """A function that keeps what `work` returns as a piece of this test, and fails with its `faults`."""
+    """A function that keeps what `work` returns as a piece of this test, and fails with its `faults`.
+
+    Beside these it may say its `case`, `counts` that are added up over pieces of a case, and `figures` that vary.
+    """
 
     def of(work: Callable[[], dict[str, Any]]) -> None:
         def timed() -> dict[str, Any]:
@@ -101,14 +105,13 @@ def amount(config: pytest.Config) -> int:
 
 
 def pytest_terminal_summary(terminalreporter, config):
-    """Write the page of the test file that ran, which has a TITLE, a `parts` of the pieces, and a NAME for the page."""
+    """Write the page of the test file that ran: its docstring, tables of what its pieces tell, and faults."""
     folder, reports = config.getoption("page"), terminalreporter.stats
     done = [report for key in ("passed", "failed", "error") for report in reports.get(key, [])]
     if folder is None or not done:
         return
-    module = importlib.import_module(
-        done[0].nodeid.partition("::")[0].removeprefix("tests/").removesuffix(".py").replace("/", ".")
-    )
+    path = config.rootpath / done[0].nodeid.partition("::")[0]
+    title, _, about = (ast.get_docstring(ast.parse(path.read_text())) or path.stem).partition("\n")
     pieces = [value for report in done for name, value in report.user_properties if name == "piece"]
     faults = [
         f"- `{report.nodeid}`: {fault}"
@@ -118,10 +121,31 @@ def pytest_terminal_summary(terminalreporter, config):
     ]
     minutes = sum(one["wall_s"] for one in pieces) / 60
     command = f"pytest {' '.join(config.args)} --amount {config.getoption('amount')}"
-    path = folder / f"{module.NAME}-{datetime.datetime.now(datetime.UTC).date()}.md"
-    parts = [heading(module.TITLE, command), f"{minutes:.0f} minutes of one process.", *module.parts(pieces)]
-    write_page(path, [*parts, "## Faults", "\n".join(faults) or "None."])
-    terminalreporter.write_line(f"{path}: {len(faults)} faults")
+    said = [heading(title.rstrip("."), command), f"{minutes:.0f} minutes of one process.", about.strip()]
+    page = folder / f"{path.stem}-{datetime.datetime.now(datetime.UTC).date()}.md"
+    write_page(page, [*said, *_tables(pieces), "## Faults", "\n".join(faults) or "None."])
+    terminalreporter.write_line(f"{page}: {len(faults)} faults")
+
+
+def _tables(pieces: Sequence[dict[str, Any]]) -> Iterator[str]:
+    """What is counted by case, and how far what is measured varies."""
+    cases: dict[str, list[dict[str, Any]]] = {}
+    for piece in pieces:
+        cases.setdefault(piece.get("case", "all"), []).append(piece)
+    names = dict.fromkeys(name for one in pieces for name in one.get("counts", {}))
+    rows = [
+        (case, *(sum(one.get("counts", {}).get(name, 0) for one in own) for name in names), len(own),
+         sum(bool(one["faults"]) for one in own))
+        for case, own in [*sorted(cases.items()), *([("together", pieces)] if len(cases) > 1 else [])]
+    ]  # fmt: skip
+    yield table(("", *names, "pieces", "pieces with faults"), rows)
+    rows = []
+    for case, own in sorted(cases.items()):
+        for figure in dict.fromkeys(name for one in own for name in one.get("figures", {})):
+            values = [one["figures"][figure] for one in own if figure in one.get("figures", {})]
+            rows.append((case, figure, *(f"{v:.3g}" for v in (min(values), statistics.median(values), max(values)))))
+    if rows:
+        yield table(("", "figure", "least", "median", "most"), rows)
 
 
 def heading(title: str, command: str) -> str:

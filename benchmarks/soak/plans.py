@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from lidardesign.scenes.scene import Body, Capsule, Scene
-from lidardesign.space import DesignSpace, observed_point
+from benchmarks.soak.scaled_flatland import NAME, ScaledFlatlandConfig, ScaledFlatlandTask
+from lidardesign.scenes.scene import Body, Capsule
+from lidardesign.space import DIMENSIONS, DesignSpace, observed_point
 from lidardesign.task import random_generator
-from soak.scaled_flatland import NAME, ScaledFlatlandConfig, ScaledFlatlandTask
 
 # What the soak promises to cover, as powers of ten: the width of the scenes, and sigma as a share of it.
 SIZES_M = (-3.0, 4.0)
@@ -19,10 +19,8 @@ SIGMA_SHARES = (-4.0, 0.0)
 MOST_SENSORS = 12
 # Below this share of the width a sigma is narrow.
 FINE_SHARE = 0.02
-DIMENSIONS = ("x_m", "y_m", "z_m", "azimuth_rad", "elevation_rad", "range_m")
 # Shipped detectors that count photons, and how far their histograms or pulses reach [m].
 DETECTORS = {"single-photon": 14.9, "consumer-8x8": 4.79}
-LENGTHS = {"x_m": 0, "y_m": 1, "z_m": 2}
 # Where a dimension stands when it is fixed, at home: in the middle of the line below, looking up at the curve.
 FIXED = {"x_m": 0.5, "y_m": 0.0, "z_m": 0.0, "azimuth_rad": math.pi / 2, "elevation_rad": 0.0}
 # Bounds of a free one; of these, one is drawn.
@@ -43,6 +41,7 @@ class RunPlan:
     seed: int
     config: dict[str, Any]
     sensors: int
+    layout: str
     fit: tuple[str, ...]
     evaluate: tuple[str, ...]
 
@@ -55,11 +54,6 @@ class RunPlan:
     def sigma_share(self) -> float:
         """Sigma as a share of that width."""
         return self.config["density"]["sigma_m"] / self.size_m
-
-    @property
-    def layout(self) -> str:
-        """The layout that `fit` is asked for."""
-        return self.fit[self.fit.index("--layout") + 1]
 
     @property
     def is_moving(self) -> bool:
@@ -93,6 +87,7 @@ def random_plan(seed: int) -> RunPlan:
             "learning": _affordable(_learning(generator, is_fine=density["sigma_m"] < FINE_SHARE * size), density),
         },
         sensors,
+        layout,
         (*_fit_options(generator, layout, sensors), *at),
         _evaluate_options(generator, layout, reach_m=np.max(space["range_m"])),
     )
@@ -113,7 +108,7 @@ def _space(generator: np.random.Generator, size: float, offset: list[float]) -> 
     free = {"range_m", *(DIMENSIONS[i] for i in generator.permutation(5)[: count - 1])}
     space: dict[str, Any] = {}
     for name in DIMENSIONS:
-        shift = offset[LENGTHS[name]] if name in LENGTHS else 0.0
+        shift = dict(zip(DIMENSIONS, offset, strict=False)).get(name, 0.0)
         unit = size if name.endswith("_m") else 1.0
         if name in free:
             space[name] = [shift + unit * bound for bound in _pick(generator, FREE[name])]
@@ -160,33 +155,16 @@ def _density(generator: np.random.Generator, size: float) -> dict[str, Any]:
 
 # What learns most densities in seconds, and what else may be asked for.
 USUAL_LEARNING: dict[str, Any] = {
-    "steps": 60,
-    "batch": 256,
-    "rate": 0.01,
-    "layers": 3,
-    "hidden": 48,
-    "bins": 16,
-    "samples": 8000,
-    "balance_proposals": 8192,
-    "coverage_proposals": 512,
-}
+    "steps": 60, "batch": 256, "rate": 0.01, "layers": 3, "hidden": 48, "bins": 16, "samples": 8000,
+    "balance_proposals": 8192, "coverage_proposals": 512,
+}  # fmt: skip
 # With a narrow sigma these are needed for a density that is worth fitting to.
 FINE_LEARNING: dict[str, Any] = {"steps": 120, "samples": 20_000}
 UNUSUAL_LEARNING: dict[str, list[Any]] = {
-    "steps": [1, 20, 300],
-    "batch": [2, 32, 512],
-    "rate": [0.001, 0.05],
-    "layers": [1, 2, 4],
-    "hidden": [4, 16, 96],
-    "bins": [2, 8],
-    "samples": [1000, 30_000],
-    "balance_proposals": [256, 4096],
-    "dtype": ["float64"],
-    "entropy": [0.3],
-    "misplaced": [0.0, 0.5],
-    "pathwise": [0, 1000],
-    "clip_norm": [0.1],
-}
+    "steps": [1, 20, 300], "batch": [2, 32, 512], "rate": [0.001, 0.05], "layers": [1, 2, 4], "hidden": [4, 16, 96],
+    "bins": [2, 8], "samples": [1000, 30_000], "balance_proposals": [256, 4096], "dtype": ["float64"],
+    "entropy": [0.3], "misplaced": [0.0, 0.5], "pathwise": [0, 1000], "clip_norm": [0.1],
+}  # fmt: skip
 UNUSUAL_SHARE = 0.1
 
 
@@ -234,13 +212,9 @@ def share_near_targets(plan: RunPlan) -> float:
     config = ScaledFlatlandConfig.model_validate(plan.config["task"])
     scenes = ScaledFlatlandTask().scenes(config, "train", plan.seed, space)
     points = observed_point(space.sample(POINTS, random_generator(plan.seed, "soak", "sight")))
-    near = NEAR_SIGMAS * plan.config["density"]["sigma_m"]
-    return float(np.any([distance_to_targets(scene, points) < near for scene in scenes], axis=0).mean())
-
-
-def distance_to_targets(scene: Scene, points: np.ndarray) -> np.ndarray:
-    """Distances of points (N, 3) from the surface of the nearest target, shape (N,) [m]."""
-    return np.min([np.abs(_signed_distance(body, points)) for body in scene.bodies if body.is_target], axis=0)
+    near_m = NEAR_SIGMAS * plan.config["density"]["sigma_m"]
+    targets = [body for scene in scenes for body in scene.bodies if body.is_target]
+    return float(np.any([np.abs(_signed_distance(body, points)) < near_m for body in targets], axis=0).mean())
 
 
 def _signed_distance(body: Body, points: np.ndarray) -> np.ndarray:

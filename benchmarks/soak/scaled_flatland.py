@@ -86,7 +86,8 @@ def offer(folder: Path) -> Path:
     made = folder / "lidardesign_soak-1.0.dist-info"
     made.mkdir(parents=True, exist_ok=True)
     (made / "METADATA").write_text("Metadata-Version: 2.1\nName: lidardesign-soak\nVersion: 1.0\n")
-    (made / "entry_points.txt").write_text(f"[lidardesign.tasks]\n{NAME} = soak.scaled_flatland:ScaledFlatlandTask\n")
+    offered = f"{NAME} = {__name__}:{ScaledFlatlandTask.__name__}"
+    (made / "entry_points.txt").write_text(f"[lidardesign.tasks]\n{offered}\n")
     return folder
 
 

@@ -10,13 +10,14 @@ import random
 import time
 import traceback
 import warnings
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from fuzz.mutators import Mutator, mutate_bytes
+from benchmarks.soak.mutators import Mutator, damaged
 from lidardesign.errors import LidardesignError
 
 MOST_SEEDS = 2000
@@ -41,6 +42,7 @@ class Target:
         mutate: How they are damaged.
         opened: In an empty folder, a function that reads a content as the program would.
         slow_s: Processor time that reading one may take [s].
+        batch: How many are one piece of a long run.
     """
 
     name: str
@@ -49,6 +51,12 @@ class Target:
     mutate: Mutator
     opened: Callable[[Path], Read]
     slow_s: float = 5.0
+    batch: int = 1000
+
+    @property
+    def folder(self) -> str:
+        """Its name for files."""
+        return "".join(letter if letter.isalnum() else "-" for letter in self.name).strip("-")
 
 
 def of_file(suffix: str, read: Callable[[Path], object]) -> Callable[[Path], Read]:
@@ -66,57 +74,34 @@ def of_file(suffix: str, read: Callable[[Path], object]) -> Callable[[Path], Rea
     return opened
 
 
-@dataclass
-class Tally:
-    """What came of a target's inputs.
-
-    Arguments:
-        read, refused: How many were taken, and how many refused.
-        slowest_s: The longest processor time of one.
-    """
-
-    read: int = 0
-    refused: int = 0
-    slowest_s: float = 0.0
-
-
-def attempt(read: Read, content: bytes, tally: Tally, slow_s: float) -> tuple[str, str | None]:
-    """Read one content; the line at which it ended, and what fault it found, if it did."""
-    before = time.process_time()
-    fault = None
+def attempt(read: Read, content: bytes, slow_s: float) -> tuple[str, str, str | None]:
+    """Read one content in so much processor time [s]: whether it was `read` or `refused`, the line, and a fault."""
+    before, how = time.process_time(), "ended otherwise"
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             warnings.simplefilter("ignore", DeprecationWarning)
             result = read(content)
-        place, fault = "read", not_finite(result)
-        tally.read += 1
+        how, place, fault = "read", "read", not_finite(result)
     except LidardesignError as error:
-        place = _place(error)
-        tally.refused += 1
-        fault = _hidden_fault(error)
+        how, place, fault = "refused", _place(error), _hidden_fault(error)
     # what is no error of the program is a fault of it, whatever it is
     except BaseException as error:
         if isinstance(error, KeyboardInterrupt):
             raise
         place, fault = _place(error), "".join(traceback.format_exception(error))
     seconds = time.process_time() - before
-    tally.slowest_s = max(tally.slowest_s, seconds)
     if fault is None and seconds > slow_s:
         fault = f"took {seconds:.1f} s of processor time"
-    return place, fault
+    return how, place, fault
 
 
 def _place(error: BaseException) -> str:
     """The last lines of the program that an error passed through; a command says its own."""
     if hasattr(error, "place"):
         return error.place
-    frames = [
-        f"{Path(frame.filename).name}:{frame.lineno}"
-        for frame in traceback.extract_tb(error.__traceback__)
-        if "lidardesign" in frame.filename
-    ]
-    return " ".join(frames[-3:])
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if "lidardesign" in frame.filename]
+    return " ".join(f"{Path(frame.filename).name}:{frame.lineno}" for frame in frames[-3:])
 
 
 def _hidden_fault(error: LidardesignError) -> str | None:
@@ -162,47 +147,36 @@ class Fuzzer:
     def __init__(self, target: Target, folder: Path, seed: int) -> None:
         self.target = target
         self.source = random.Random(f"{target.name} {seed}")
-        self.seeds = target.seeds(_made(folder / "seeds"))
+        self.work = folder / "work"
+        for part in (folder / "seeds", self.work):
+            part.mkdir(parents=True)
+        self.seeds = target.seeds(folder / "seeds")
         self._good, self._places = list(self.seeds), set()
-        self.tally = Tally()
-        self.work = _made(folder / "work")
+        self.ends: Counter[str] = Counter()
         with contextlib.chdir(self.work):
             self.read = target.opened(self.work)
-        self.present = _names(self.work)
+        self.present = set(os.listdir(self.work))
 
     def next(self) -> bytes:
-        """The next damaged content; damage that a mutator cannot do to a damaged file is done to its bytes."""
+        """The next damaged content."""
         content = self.source.choice(self._good if self.source.random() < GOOD_SHARE else self.seeds)
-        try:
-            return self.target.mutate(content, self.source, self._good)
-        # mutators parse what they change; a damaged file may not be what they parse
-        except Exception:
-            return mutate_bytes(content, self.source, self._good)
+        return damaged(self.target.mutate, content, self.source, self._good)
 
     def run(self, content: bytes) -> str | None:
         """Read a content, in a folder of its own; what fault it found."""
         with contextlib.chdir(self.work):
-            place, fault = attempt(self.read, content, self.tally, self.target.slow_s)
-        fault = fault or self._left_behind()
-        new = place not in self._places or (place == "read" and self.source.random() < KEPT_SHARE)
+            how, place, fault = attempt(self.read, content, self.target.slow_s)
+        self.ends[how] += 1
+        new = place not in self._places or (how == "read" and self.source.random() < KEPT_SHARE)
         if new and len(self.seeds) < MOST_SEEDS:
             self._places.add(place)
             self.seeds.append(content)
-        return fault
+        return fault or self._left_behind()
 
     def _left_behind(self) -> str | None:
         """Files that only reading has made: whatever they are, reading must make none."""
-        made = {name for name in _names(self.work) - self.present if not name.startswith("input")}
+        made = {name for name in set(os.listdir(self.work)) - self.present if not name.startswith("input")}
         for name in made:
             with contextlib.suppress(OSError):
                 (self.work / name).unlink()
         return f"reading made {', '.join(sorted(made))}" if made else None
-
-
-def _made(folder: Path) -> Path:
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
-
-
-def _names(folder: Path) -> set[str]:
-    return {entry.name for entry in os.scandir(folder)}

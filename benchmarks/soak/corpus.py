@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import base64
 import io
 import json
+import shutil
+import tempfile
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 
 import h5py
@@ -13,18 +17,23 @@ import trimesh
 import yaml
 from scipy.io import savemat
 from support.captures import BIN_PS, BINS, make_capture
-from support.command_line import make_run
+from support.command_line import files_under, make_run
+from support.docs_session import in_process
+from support.robots import mjcf
 from support.sensors import normal_sensor
 
+from benchmarks.soak.mutators import packed
 from lidardesign.config import resolve
 from lidardesign.formats.galvo import write_galvo
 from lidardesign.formats.ray_lists import QUERY_COLUMN, write_sensor_csv
+from lidardesign.formats.registry import EXPORTERS
+from lidardesign.parts.catalogue import FOLDER as PARTS
 from lidardesign.registry import load_task
-from lidardesign.run.manifest import note, read_manifest
+from lidardesign.run.manifest import record
 from lidardesign.run.yaml import dump_yaml
 from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.design import DesignSpec
-from lidardesign.sensors.design_file import design_document
+from lidardesign.sensors.design_file import design_document, save_design
 from lidardesign.sensors.pattern import Pattern
 from lidardesign.sensors.sensor import Sensor
 from lidardesign.simulate.detector.files import FOLDER as DETECTORS
@@ -135,29 +144,31 @@ def detectors(_: Path) -> list[bytes]:
     return [*shipped, b"name: mine\npulse_fwhm_ps: 100\njitter_fwhm_ns: 0.2\nbin_ps: 50\nbins: 500\nestimator: peak\n"]
 
 
-def mesh_exports(kind: str) -> list[bytes]:
+def meshes(kind: str) -> Callable[[Path], list[bytes]]:
     """A box, a ball and two boxes in one file format."""
     shapes = [trimesh.creation.box((1, 2, 3)), trimesh.creation.icosphere(1, 0.5)]
     pair = trimesh.Scene({"a": shapes[0], "b": shapes[1].copy().apply_translation((3, 0, 0))})
-    encodings = {"stl": ("stl", "stl_ascii"), "ply": ("ply",), "gltf": ()}.get(kind, (kind,))
-    found = [shape.export(file_type=encoding) for shape in shapes for encoding in encodings]
-    if kind == "ply":
-        found.append(shapes[0].export(file_type="ply", encoding="ascii"))
-    if kind in ("glb", "obj"):
-        found.append(pair.export(file_type=kind))
-    if kind == "gltf":
-        found = [_embedded(pair.export(file_type="gltf"))]
-    return [content.encode() if isinstance(content, str) else bytes(content) for content in found]
+    encodings = {"stl": ("stl", "stl_ascii"), "gltf": ()}.get(kind, (kind,))
+
+    def good(_: Path) -> list[bytes]:
+        found = [shape.export(file_type=encoding) for shape in shapes for encoding in encodings]
+        if kind == "ply":
+            found.append(shapes[0].export(file_type="ply", encoding="ascii"))
+        if kind in ("glb", "obj"):
+            found.append(pair.export(file_type=kind))
+        if kind == "gltf":
+            found.append(_embedded(pair.export(file_type="gltf")))
+        return [content.encode() if isinstance(content, str) else bytes(content) for content in found]
+
+    return good
 
 
-def _embedded(files: dict[str, bytes]) -> bytes:
+def _embedded(files: dict[str, bytes]) -> str:
     """A .gltf with its buffers inside, as data addresses."""
-    import base64
-
     document = json.loads(files["model.gltf"])
     for buffer in document["buffers"]:
         buffer["uri"] = "data:application/octet-stream;base64," + base64.b64encode(files[buffer["uri"]]).decode()
-    return json.dumps(document).encode()
+    return json.dumps(document)
 
 
 def face_models(_: Path) -> list[bytes]:
@@ -194,7 +205,7 @@ def _captured() -> list[dict[str, np.ndarray]]:
     return [{name: np.asarray(value) for name, value in arrays.items()} for arrays in both]
 
 
-def _packed(write: Callable[[io.BytesIO], object]) -> bytes:
+def _written(write: Callable[[io.BytesIO], object]) -> bytes:
     buffer = io.BytesIO()
     write(buffer)
     return buffer.getvalue()
@@ -202,13 +213,13 @@ def _packed(write: Callable[[io.BytesIO], object]) -> bytes:
 
 def captures_npz(_: Path) -> list[bytes]:
     """Captures as numpy archives."""
-    return [_packed(lambda buffer, arrays=arrays: np.savez_compressed(buffer, **arrays)) for arrays in _captured()]
+    return [_written(lambda buffer, arrays=arrays: np.savez_compressed(buffer, **arrays)) for arrays in _captured()]
 
 
 def captures_matlab(_: Path) -> list[bytes]:
     """Captures as MATLAB 5 files, packed and not."""
     pairs = zip(_captured(), (True, False), strict=True)
-    return [_packed(lambda buffer, one=one: savemat(buffer, one[0], do_compression=one[1])) for one in pairs]
+    return [_written(lambda buffer, one=one: savemat(buffer, one[0], do_compression=one[1])) for one in pairs]
 
 
 def captures_hdf5(_: Path) -> list[bytes]:
@@ -234,8 +245,6 @@ def steering_lists(folder: Path) -> list[bytes]:
 
 def robots(_: Path) -> list[bytes]:
     """The embedded arm, a chain of capsules, and one with what models may have besides."""
-    piece = '<body pos="0 0 .18"><joint axis="{}"/><geom type="capsule" size=".03" fromto="0 0 0 0 0 .18"/>'
-    chain = "".join(piece.format("0 0 1" if link % 2 else "0 1 0") for link in range(7)) + "</body>" * 7
     further = (
         '<compiler angle="degree" meshdir="."/><option timestep="0.002"/><default><geom rgba="1 0 0 1"/></default>'
         '<asset><mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset>'
@@ -243,32 +252,104 @@ def robots(_: Path) -> list[bytes]:
     )
     world = '<geom type="plane" size="1 1 1"/><body pos="1 0 0"><geom type="mesh" mesh="m"/></body>'
     embedded = ROOT / "tasks" / "lidardesign_tasks" / "data" / "iiwa14.xml"
-    return [
-        embedded.read_bytes(),
-        f"<mujoco><worldbody>{chain}</worldbody></mujoco>".encode(),
-        f"<mujoco>{further}<worldbody>{world}{chain}</worldbody></mujoco>".encode(),
-    ]
+    return [embedded.read_bytes(), mjcf().encode(), mjcf(inside=further, world=world).encode()]
 
 
-def manifests(folder: Path) -> list[bytes]:
-    """The manifest of a run that was learned."""
-    run = make_run(folder / "run", count=50)
-    note(run, learn={"ess": 0.5, "notes": []}, visibility="raycast", timings={"learn": 1.0})
-    return [json.dumps(read_manifest(run)).encode()]
+ROBOT = """<mujoco model="arm"><default><geom rgba="1 0 0 1"/></default><worldbody>
+<geom name="ground" type="box" size="2 2 .1" pos="0 0 -.1"/>
+<body name="base" pos="0 0 .5"><geom name="trunk" type="box" size=".1 .1 .4"/>
+<body name="arm" pos=".15 0 .4"><joint name="lift" axis="0 1 0" range="-80 80"/>
+<geom name="upper" type="capsule" size=".04" fromto="0 0 0 .4 0 0"/>
+<body name="hand" pos=".5 0 0"><joint name="turn" type="slide" axis="0 0 1" range="-.2 .2"/>
+<geom name="palm" type="ellipsoid" size=".06 .05 .04"/><camera name="eye" fovy="40"/></body></body></body>
+<body name="parcel" pos="1 0 .1"><freejoint name="parcel"/><geom name="lid" type="cylinder" size=".1 .1"/></body>
+</worldbody><keyframe><key qpos="0 0 1 0 .1 1 0 0 0"/></keyframe></mujoco>"""
+URDF = """<robot name="arm"><link name="base"><visual><geometry><box size=".1 .1 .4"/></geometry></visual></link>
+<link name="hand"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
+<visual><origin xyz="0 0 .1" rpy="0 .1 0"/><geometry><sphere radius=".1"/></geometry></visual></link>
+<joint name="turn" type="revolute"><parent link="base"/><child link="hand"/><origin xyz="0 0 .3"/><axis xyz="0 0 1"/>
+<limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>"""
 
 
-def samples(folder: Path) -> list[bytes]:
-    """The samples of a run."""
-    return [(make_run(folder / "run", count=300) / "samples.npz").read_bytes()]
+def models(folder: Path) -> list[bytes]:
+    """Robots as MuJoCo loads them."""
+    return [ROBOT.encode(), URDF.encode(), *robots(folder)]
 
 
-def progresses(_: Path) -> list[bytes]:
-    """The progress of learning, one JSON document per line."""
-    rows = [{"step": step, "loss": -1.5, "ess": 0.4, "seconds": step / 10} for step in range(10, 60, 10)]
-    return ["".join(json.dumps(row) + "\n" for row in rows).encode()]
+def _motion() -> dict[str, np.ndarray]:
+    times = np.linspace(0.0, 2.0, 12)
+    names = ("parcel.x", "parcel.y", "parcel.z", "parcel.qw", "parcel.qx", "parcel.qy", "parcel.qz")
+    rest = {name: np.full(12, value) for name, value in zip(names, (1, 0, 0.1, 1, 0, 0, 0), strict=True)}
+    return {"time_s": times, "lift": np.sin(times), "turn": 0.1 * times, **rest}
+
+
+def recordings_csv(_: Path) -> list[bytes]:
+    """How the robot moves, as a table."""
+    motion = _motion()
+    rows = [",".join(motion), *(",".join(map(repr, row)) for row in np.stack(list(motion.values()), axis=1).tolist())]
+    return ["\n".join(rows).encode(), "\n".join(row.replace(",", ", ") for row in rows).encode()]
+
+
+def recordings_npz(_: Path) -> list[bytes]:
+    """How the robot moves, as arrays: by joint, and whole."""
+    motion = _motion()
+    whole = {"time_s": motion["time_s"], "qpos": np.stack([motion[name] for name in list(motion)[1:]], axis=1)}
+    return [_written(lambda buffer, arrays=arrays: np.savez(buffer, **arrays)) for arrays in (motion, whole)]
+
+
+def poses(_: Path) -> list[bytes]:
+    """Bodies that move, with both kinds of rotations."""
+    header = "time_s,body,x_m,y_m,z_m"
+    plain = f"{header}\n0,a,0,0,0\n1,a,1,0,0\n0.5,b,0,1,0\n"
+    turned = f"{header},qw,qx,qy,qz\n0,a,0,0,0,1,0,0,0\n1,a,1,0,0,0,0,0,2\n"
+    rolled = f"{header},roll_deg,pitch_deg,yaw_deg\n0,a,0,0,0,0,0,0\n2.5,a,1,0,0,90,-10,180\n"
+    return [text.encode() for text in (plain, turned, rolled)]
+
+
+def rigs(kind: str) -> Callable[[Path], list[bytes]]:
+    """Designs as other programs have them."""
+
+    def good(folder: Path) -> list[bytes]:
+        found, exporter = [], EXPORTERS[kind]
+        for index in (0, 1) if kind in ("sdf", "mjcf") else (1, 4):
+            design, path = sample_designs()[index], folder / f"rig{index}{exporter.suffix}"
+            exporter.write(design, design.rays(), path)
+            found.append(path.read_bytes())
+        return found
+
+    return good
+
+
+def part_files(_: Path) -> list[bytes]:
+    """Parts of the catalog, of every kind of pattern."""
+    return [path.read_bytes() for path in sorted(PARTS.glob("*.yaml"))[::3]]
+
+
+# Two steps of a small flow, measured roughly.
+SMALL = (
+    "learning.steps=2", "learning.samples=1000", "learning.batch=16", "learning.hidden=8", "learning.layers=1",
+    "learning.bins=4", "learning.balance_proposals=256", "learning.coverage_proposals=256",
+)  # fmt: skip
+
+
+@lru_cache
+def _run_folder() -> bytes:
+    with tempfile.TemporaryDirectory() as name:
+        run, settings = Path(name) / "run", [word for value in SMALL for word in ("--set", value)]
+        ran = in_process(["learn", "flatland", "--preset", "draft", "--out", run, *settings])
+        assert ran.code == 0, ran.err
+        shutil.copy(make_run(Path(name) / "other", count=1000) / "samples.npz", run / "samples.npz")
+        save_design(sample_designs()[0], run / "designs" / "fit.yaml")
+        record(run, ["samples.npz", "designs/fit.yaml"])
+        return packed(files_under(run))
+
+
+def run_folders(_: Path) -> list[bytes]:
+    """A run with a design, packed: what two steps of learning leave, but with samples that are worth a fit."""
+    return [_run_folder()]
 
 
 def distance_fields(_: Path) -> list[bytes]:
     """A cached distance field."""
     field = np.linspace(-1, 1, 64, dtype=np.float32)
-    return [_packed(lambda buffer: np.save(buffer, field, allow_pickle=False))]
+    return [_written(lambda buffer: np.save(buffer, field, allow_pickle=False))]

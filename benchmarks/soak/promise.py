@@ -1,4 +1,4 @@
-"""The planner's promise in random scenes.
+"""Random plans of effects, `make soak-promise`: nothing that is skipped changes more than is tolerated.
 
 What a plan skips changes ranges by no more than its tolerance, rms over returns, and no more than its share of returns:
 ray by ray, with the same random numbers, against all effects but multipath, which needs another program.
@@ -10,9 +10,11 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pytest
 import trimesh
 from support.planning import CONSUMER, SINGLE, TIMED, grid, random_shapes
 
+from benchmarks.soak.long_runs import amount
 from lidardesign.scenes.rays import Rays, Returns
 from lidardesign.scenes.scene import Ambient, Body, Box, Medium, Mesh, Receiver, Scene, rigid
 from lidardesign.simulate.detector.physics import EFFECTS, Detector, Physics
@@ -20,6 +22,7 @@ from lidardesign.simulate.effects.first_hits import FirstHits
 from lidardesign.simulate.plan import Planner, Tolerance
 from lidardesign.simulate.returns import build_casters, simulate
 
+BLOCK = 50
 SIMULATED = frozenset(EFFECTS) - {"multipath"}
 # Each is measured so many times with other chance, and compared within so many standard errors.
 REPEATS = 4
@@ -204,3 +207,20 @@ def kept_promise(case: Case) -> Kept:
     # ranges of meshes are exact to float32
     most_m2 = (case.tolerance.range_m + 1e-6) ** 2
     return Kept(case, tuple(sorted(skipped)), math.sqrt(mean), share, mean - error > most_m2 or share > allowed)
+
+
+def pytest_generate_tests(metafunc):
+    plans = amount(metafunc.config)
+    metafunc.parametrize(("first", "end"), [(at, min(at + BLOCK, plans)) for at in range(0, plans, BLOCK)])
+
+
+@pytest.mark.long
+@pytest.mark.filterwarnings("default")
+def test_what_is_skipped_changes_no_more_than_is_tolerated(piece, first, end):
+    def work():
+        found = {seed: kept_promise(random_case(seed)) for seed in range(first, end)}
+        faults = [f"seed {seed}: {kept}" for seed, kept in found.items() if kept.broken]
+        skipping = sum(bool(kept.skipped) for kept in found.values())
+        return {"counts": {"plans": len(found), "skipping something": skipping}, "faults": faults}
+
+    piece(work)
