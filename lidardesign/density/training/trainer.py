@@ -444,7 +444,7 @@ class Trainer(LearnedFlow):
         self._restore_arrays(arrays)
         self.generator.set_state(torch.as_tensor(arrays["generator"]))
         for name in (*COUNTERS, "stopped", "least_misplaced"):
-            setattr(self, name, state[name])
+            setattr(self, name, state.get(name))
         self.seconds_before, self._started = state["seconds"], time.perf_counter()
         clear_snapshots(self.run, beyond=self.step)
         path = self.run / PROGRESS
