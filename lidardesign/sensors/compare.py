@@ -24,38 +24,26 @@ FAR_SIZES = 10.0
 MODEL_KEYS = ("bin_ps", "bits_per_bin", "rate_hz")
 
 
-@dataclass(frozen=True, eq=False)
-class SensorPair:
-    """A sensor of each of two designs; one is None where the other design has more.
-
-    Arguments:
-        first, second: The sensors of the first and the second design.
-    """
-
-    first: Sensor | None
-    second: Sensor | None
-
-    def as_dict(self) -> dict[str, Any]:
-        """Names and the differences, second minus first: metres, degrees and shares; None for a sensor left over."""
-        named = {"a": self.first.name if self.first else None, "b": self.second.name if self.second else None}
-        if self.first is None or self.second is None:
-            return {**named, "difference": None}
-        first, second = self.first, self.second
-        fields = np.degrees(np.subtract(second.field_of_view_rad, first.field_of_view_rad))
-        gates = np.subtract(second.gate_m, first.gate_m)
-        return {
-            **named,
-            "difference": {
-                "place_m": float(np.linalg.norm(second.origin_m - first.origin_m)),
-                "boresight_deg": math.degrees(angle_between(first.boresight, second.boresight)),
-                "roll_deg": math.degrees(math.remainder(second.roll_rad - first.roll_rad, math.tau)),
-                "horizontal_deg": float(fields[0]),
-                "vertical_deg": float(fields[1]),
-                "gate_start_m": float(gates[0]),
-                "gate_end_m": float(gates[1]),
-                "weight": second.weight - first.weight,
-            },
-        }
+def difference(first: Sensor | None, second: Sensor | None) -> dict[str, Any]:
+    """Names and the differences, second minus first: metres, degrees and shares; None for a sensor left over."""
+    named = {"a": first.name if first else None, "b": second.name if second else None}
+    if first is None or second is None:
+        return {**named, "difference": None}
+    fields = np.degrees(np.subtract(second.field_of_view_rad, first.field_of_view_rad))
+    gates = np.subtract(second.gate_m, first.gate_m)
+    return {
+        **named,
+        "difference": {
+            "place_m": float(np.linalg.norm(second.origin_m - first.origin_m)),
+            "boresight_deg": math.degrees(angle_between(first.boresight, second.boresight)),
+            "roll_deg": math.degrees(math.remainder(second.roll_rad - first.roll_rad, math.tau)),
+            "horizontal_deg": float(fields[0]),
+            "vertical_deg": float(fields[1]),
+            "gate_start_m": float(gates[0]),
+            "gate_end_m": float(gates[1]),
+            "weight": second.weight - first.weight,
+        },
+    }
 
 
 def angle_between(first: np.ndarray, second: np.ndarray) -> float:
@@ -63,11 +51,11 @@ def angle_between(first: np.ndarray, second: np.ndarray) -> float:
     return 2 * math.atan2(float(np.linalg.norm(first - second)), float(np.linalg.norm(first + second)))
 
 
-def paired_sensors(first: DesignSpec, second: DesignSpec) -> list[SensorPair]:
-    """The sensors of two designs in pairs, in the order of the first; those left over at the end."""
+def paired_sensors(first: DesignSpec, second: DesignSpec) -> list[tuple[Sensor | None, Sensor | None]]:
+    """The sensors of two designs in pairs, in the order of the first; those left over, with None, at the end."""
     by_name = {sensor.name: sensor for sensor in second.sensors}
     if {sensor.name for sensor in first.sensors} == set(by_name):
-        return [SensorPair(sensor, by_name[sensor.name]) for sensor in first.sensors]
+        return [(sensor, by_name[sensor.name]) for sensor in first.sensors]
     from scipy.optimize import linear_sum_assignment
 
     range_m = float(np.mean([sensor.gate_m for sensor in (*first.sensors, *second.sensors)])) or RIGHT_ANGLE_M
@@ -83,9 +71,9 @@ def paired_sensors(first: DesignSpec, second: DesignSpec) -> list[SensorPair]:
     # the difference of each sensor of one design from each of the other, shape (G, H) [m]
     distances_m = sum(np.linalg.norm(one[key][:, None] - other[key][None], axis=2) for key in one)
     rows, columns = linear_sum_assignment(distances_m)
-    pairs = [SensorPair(first.sensors[row], second.sensors[column]) for row, column in zip(rows, columns, strict=True)]
-    pairs += [SensorPair(sensor, None) for index, sensor in enumerate(first.sensors) if index not in rows]
-    return pairs + [SensorPair(None, sensor) for index, sensor in enumerate(second.sensors) if index not in columns]
+    pairs = [(first.sensors[row], second.sensors[column]) for row, column in zip(rows, columns, strict=True)]
+    pairs += [(sensor, None) for index, sensor in enumerate(first.sensors) if index not in rows]
+    return pairs + [(None, sensor) for index, sensor in enumerate(second.sensors) if index not in columns]
 
 
 @dataclass(frozen=True)

@@ -206,7 +206,9 @@ class DesignSpec:
         moves, here = self._moves(at), {**self.at, **at}
         sensors = tuple(replace(sensor, origin_m=with_coordinates(sensor.origin_m, moves)) for sensor in self.sensors)
         if self.condition is None:
-            patterns = tuple(pattern.moved(moves) for pattern in self.patterns)
+            patterns = tuple(
+                replace(pattern, origin_m=with_coordinates(pattern.origin_m, moves)) for pattern in self.patterns
+            )
         else:
             patterns = tuple(Pattern.of(pattern.at(at.get(self.condition))) for pattern in self.patterns)
         kept = self.certificates if here == self.at or self.condition is not None else ()

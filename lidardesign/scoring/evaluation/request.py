@@ -23,7 +23,7 @@ from lidardesign.scoring.baselines.cma import CmaSettings
 from lidardesign.scoring.baselines.simple import ALWAYS, BASELINES, check_baseline
 from lidardesign.scoring.evaluation.mounting import MountError
 from lidardesign.scoring.scene_scores import RaysPerCondition, ScenePass
-from lidardesign.sensors.adaptive import AdaptivePatterns, AdaptiveRays
+from lidardesign.sensors.adaptive import AdaptivePatterns, AdaptiveRays, mapped
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.simulate.calibration import with_part_light
@@ -136,7 +136,7 @@ class EvaluationRequest:
     def following(self, design: DesignSpec, adaptive: AdaptivePatterns) -> AdaptiveRays:
         """The rays of a design's patterns that follow what they see, with the detector's light."""
         rays = adaptive.rays(features_of(self.task))
-        return rays.mapped(lambda one: with_part_light(one, design, self.planner.detector))
+        return mapped(rays, lambda one: with_part_light(one, design, self.planner.detector))
 
     def scene_pass(
         self, fired: Callable[[int], Sequence[RaysPerCondition]], planner: Planner, plans: Sequence[EffectPlan] = ()
