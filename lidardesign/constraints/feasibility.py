@@ -285,7 +285,6 @@ def _check_budget(constraints: Constraints, needed: Sequence[SensorRules], least
         _refuse(f"{given.value} rays for {least.value:g} sensors", [given.name, least.name or "sensors"])
     if budget.bandwidth_mbps is None:
         return
-    model = Bandwidth(budget.bin_ps, budget.bits_per_bin, budget.rate_hz)
     widths = [least_width(rules) for rules in needed]
     numbers = [_Bound(1, ""), least] + ([given] if given.value is not None else [])
     common, least_of_all = least_width(constraints.rules[-1]), min(width for width, _ in widths)
@@ -294,7 +293,7 @@ def _check_budget(constraints: Constraints, needed: Sequence[SensorRules], least
     narrowest += [common] if common[0] <= least_of_all else []
     # the fewest names first: one ray of any gate, then as many as are asked for, then as wide as is asked for
     for (width, names), rays in sorted(itertools.product(narrowest, numbers), key=lambda pair: len(pair[0][1])):
-        mbps = model.mbps_of_widths([width], int(rays.value))
+        mbps = budget.readout.mbps_of_widths([width], int(rays.value))
         if mbps > budget.bandwidth_mbps:
             text = f"{rays.value:g} rays need at least {mbps:g} Mbit/s, more than {budget.bandwidth_mbps:g} Mbit/s"
             _refuse(text, [rays.name, "budget.bandwidth_mbps", *names])
@@ -306,8 +305,7 @@ def most_rays(constraints: Constraints) -> int | None:
     if budget.bandwidth_mbps is None:
         return None
     narrowest = min(least_width(rules)[0] for rules in constraints.rules)
-    model = Bandwidth(budget.bin_ps, budget.bits_per_bin, budget.rate_hz)
-    return max(int(budget.bandwidth_mbps / model.mbps_of_widths([narrowest], 1)), 1)
+    return max(int(budget.bandwidth_mbps / budget.readout.mbps_of_widths([narrowest], 1)), 1)
 
 
 def least_width(rules: SensorRules) -> tuple[float, list[str]]:
@@ -344,9 +342,8 @@ class BandwidthBudget:
         budget = constraints.budget
         names = ["budget.rays"] if budget.rays is not None else ["--rays"] if rays is not None else []
         names += [name for rules in constraints.rules for name in least_width(rules)[1]]
-        model = Bandwidth(budget.bin_ps, budget.bits_per_bin, budget.rate_hz)
         wanted = budget.rays if rays is None else rays
-        return cls(model, budget.bandwidth_mbps, wanted, tuple(dict.fromkeys(names)))
+        return cls(budget.readout, budget.bandwidth_mbps, wanted, tuple(dict.fromkeys(names)))
 
     def mbps(self, widths_m: np.ndarray, weights: np.ndarray, rays: int) -> float:
         """Bandwidth of gates (K,) [m] whose rays are split by weights (K,)."""

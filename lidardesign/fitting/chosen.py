@@ -37,7 +37,7 @@ from lidardesign.run.clock import phase
 from lidardesign.samples import Samples
 from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.adaptive import AdaptivePatterns
-from lidardesign.sensors.bandwidth import Bandwidth, split_budget
+from lidardesign.sensors.bandwidth import split_budget
 from lidardesign.sensors.pattern import Pattern
 from lidardesign.sensors.sensor import Sensor, interval_factor, tangent_directions
 from lidardesign.space import (
@@ -133,7 +133,7 @@ def choose_rays(
         rays=Rays.joined(lists),
         visits=[slice(*pair) for pair in itertools.pairwise(ends)],
         gates=limits.choices,
-        bandwidth=Bandwidth(budget.bin_ps, budget.bits_per_bin, budget.rate_hz),
+        bandwidth=budget.readout,
         limit_mbps=np.inf if budget.bandwidth_mbps is None else budget.bandwidth_mbps,
         shares=weights if len(lists) > 1 else None,
         is_shared=gates != "ray",

@@ -280,8 +280,7 @@ class GoalSearch:
 
     def __init__(self, request: FitRequest, fit: Callable[[FitRequest], DesignSpec], scenes: HeldBackScenes) -> None:
         self.request, self.metric, self.scenes, self._fit = request, request.run.metric, scenes, fit
-        budget = request.constraints.budget
-        self._model = Bandwidth(budget.bin_ps, budget.bits_per_bin, budget.rate_hz)
+        self._model = request.constraints.budget.readout
         self.tried: list[GoalTrial] = []
         self._refused: InfeasibleError | None = None
 

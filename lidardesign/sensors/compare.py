@@ -35,7 +35,7 @@ def difference(first: Sensor | None, second: Sensor | None) -> dict[str, Any]:
         **named,
         "difference": {
             "place_m": float(np.linalg.norm(second.origin_m - first.origin_m)),
-            "boresight_deg": math.degrees(angle_between(first.boresight, second.boresight)),
+            "boresight_deg": math.degrees(angles_between(first.boresight, second.boresight)),
             "roll_deg": math.degrees(math.remainder(second.roll_rad - first.roll_rad, math.tau)),
             "horizontal_deg": float(fields[0]),
             "vertical_deg": float(fields[1]),
@@ -46,9 +46,9 @@ def difference(first: Sensor | None, second: Sensor | None) -> dict[str, Any]:
     }
 
 
-def angle_between(first: np.ndarray, second: np.ndarray) -> float:
-    """The angle of two unit vectors (3,), exact for the smallest too [rad]."""
-    return 2 * math.atan2(float(np.linalg.norm(first - second)), float(np.linalg.norm(first + second)))
+def angles_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Angles between unit vectors (..., 3), exact for the smallest too, shape (...) [rad]."""
+    return 2 * np.arctan2(np.linalg.norm(first - second, axis=-1), np.linalg.norm(first + second, axis=-1))
 
 
 def paired_sensors(first: DesignSpec, second: DesignSpec) -> list[tuple[Sensor | None, Sensor | None]]:

@@ -17,8 +17,8 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validat
 from lidardesign.errors import ConfigError, page
 from lidardesign.numerics import COARSE_SLACK, SLACK
 from lidardesign.run.files import write_atomic
-from lidardesign.run.validation import check_model, is_name
-from lidardesign.run.yaml import KeyPath, dump_yaml
+from lidardesign.run.validation import check_model, is_name, placed_at
+from lidardesign.run.yaml import dump_yaml
 from lidardesign.sensors.adaptive import AdaptivePatterns, PatternRule
 from lidardesign.sensors.design import DesignSpec, LayoutName
 from lidardesign.sensors.pattern import Pattern
@@ -333,11 +333,7 @@ def design_from_document(document: Any, where: str = "design", locate: Callable[
     Raises:
         ConfigError: A key is missing, unknown, of the wrong kind, or contradicts another.
     """
-
-    def named(path: KeyPath, *, key: bool = False) -> str:
-        return where
-
-    locate = locate or named
+    locate = locate or placed_at(where)
     if not isinstance(document, dict) or "sensors" not in document:
         raise ConfigError(
             "this is not a design: it has no key `sensors`",

@@ -12,7 +12,7 @@ from support.sensors import normal_sensor
 
 from lidardesign.formats.designs import load_design
 from lidardesign.sensors.bandwidth import Bandwidth
-from lidardesign.sensors.compare import angle_between, difference, paired_sensors, readout_of
+from lidardesign.sensors.compare import angles_between, difference, paired_sensors, readout_of
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.pattern import Pattern
 from lidardesign.space import direction
@@ -64,7 +64,7 @@ def test_differences_turn_their_sign_with_the_order_and_sensors_left_over_are_na
 
 def test_an_angle_is_exact_for_the_smallest_and_the_largest():
     for angle in (0.0, 1e-9, 1e-4, 1.0, math.pi - 1e-9, math.pi):
-        found = angle_between(direction(0.0, 0.0), direction(angle, 0.0))
+        found = angles_between(direction(0.0, 0.0), direction(angle, 0.0))
         assert found == pytest.approx(angle, rel=1e-7, abs=1e-15)
 
 
