@@ -18,8 +18,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
-from lidardesign.density.fields.distance import TableField
-from lidardesign.density.fields.importance import TableWeights
+from lidardesign.density.fields.distance import GridColumns, TableField
 from lidardesign.density.objective.quadrature import Quadrature
 from lidardesign.density.objective.surfaces import SceneTable
 from lidardesign.density.objective.target import Target
@@ -158,7 +157,7 @@ class DeviceTarget(Target):
 class _Table:
     """A table of distances, or of other values, on a device: shape (grid points, columns)."""
 
-    def __init__(self, source: TableField | TableWeights, device: torch.device) -> None:
+    def __init__(self, source: GridColumns, device: torch.device) -> None:
         grid = source.grid
         self._table = torch.as_tensor(source.table).to(device)
         self._low = torch.as_tensor(grid.low).to(device)

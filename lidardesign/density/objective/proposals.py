@@ -23,6 +23,7 @@ import numpy as np
 
 from lidardesign.config import DensitySettings
 from lidardesign.density.fields.distance import scene_columns
+from lidardesign.density.objective.surfaces import log_peak
 from lidardesign.density.objective.target import Target, build_target
 from lidardesign.numerics import normalised_weights
 from lidardesign.samples import Samples
@@ -61,6 +62,12 @@ def independent_points(target: Target, count: int, generator: np.random.Generato
     return proposals.points, proposals.log_density
 
 
+def independent_samples(target: Target, count: int, generator: np.random.Generator) -> Samples:
+    """`independent_points` with log p* at them; none where no ray of the space comes near a surface."""
+    points, log_density = independent_points(target, count, generator)
+    return Samples(points, log_density, target.log_density(points), target.space)
+
+
 def log_proposal(target: Target, points: np.ndarray) -> np.ndarray | None:
     """log of the density of `independent_points` at points of the space, (N, 6) to (N,), up to the same constant.
 
@@ -86,7 +93,7 @@ def _are_drawn_by_surfaces(target: Target) -> bool:
 
 def _is_near(target: Target, log_proximity: np.ndarray) -> np.ndarray:
     """The points that come within `FARTHEST_SIGMAS` of a surface, as a mask (N,)."""
-    return log_proximity > target.surfaces.log_peak - FARTHEST_SIGMAS**2 / 2
+    return log_proximity > log_peak(target.surfaces) - FARTHEST_SIGMAS**2 / 2
 
 
 def resampled_proposals(target: Target, count: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -121,9 +128,7 @@ def samples_without_visibility(
         count: The number of draws; those that leave the space are dropped.
         generator: Of all draws.
     """
-    target = build_target(scenes, space, settings, "off")
-    points, log_density = independent_points(target, count, generator)
-    return Samples(points, log_density, target.log_density(points), space)
+    return independent_samples(build_target(scenes, space, settings, "off"), count, generator)
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,7 @@ from lidardesign.density.fields.bodies import collect_bodies
 from lidardesign.density.fields.distance import TableField, build_field, scene_columns
 from lidardesign.density.fields.importance import BodyWeights, build_log_weights, is_weighted, weigh
 from lidardesign.density.objective.quadrature import Quadrature
-from lidardesign.density.objective.surfaces import MovingFrames, SceneTable, Surfaces
+from lidardesign.density.objective.surfaces import MovingFrames, SceneTable, Surfaces, raycast
 from lidardesign.density.objective.visibility import (
     BistaticVisibility,
     NoVisibility,
@@ -38,8 +38,6 @@ PADDING_SIGMAS = 4.0
 MOST_QUADRATURE_BODIES = 2000
 # d direction / d sin(elevation) grows without bound at the poles; it is capped at this cosine of the elevation.
 MINIMUM_POLE_COSINE = 1e-4
-# Cells per axis are 2 to this power: finer than the points of a batch lie apart.
-LEVELS = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,9 +105,8 @@ class Target:
             raise NumericalError("design points are not finite, or their range_m is negative", where="target density")
         optics = self.optics if sigma_m is None else self.optics.widened(sigma_m)
         values, gradients = np.empty(len(points)), np.empty((len(points) if gradient else 0, 6))
-        size, order = self.rows_at_once, nearby_order(observed_point(points))
-        for start in range(0, len(points), size):
-            rows = order[start : start + size]
+        for start in range(0, len(points), self.rows_at_once):
+            rows = slice(start, start + self.rows_at_once)
             values[rows], by_chart = self._evaluate(points[rows], optics, gradient)
             if gradient:
                 gradients[rows] = by_chart
@@ -137,25 +134,6 @@ class Target:
         by_chart[:, ELEVATION] = np.einsum("nk,nk->n", by_ray.directions, by_elevation)
         by_chart[:, RANGE] = by_ray.ranges
         return values, by_chart
-
-
-def nearby_order(points: np.ndarray) -> np.ndarray:
-    """The order of points (N, 3) along a Z-shaped curve through their bounding box, shape (N,) (Morton 1966).
-
-    Neighbours in space follow each other and find each other's memory in the cache. Results do not depend on it, to the
-    last bit: every point is evaluated by itself.
-    """
-    if len(points) < 2:
-        return np.arange(len(points))
-    size = np.ptp(points, axis=0)
-    # points that share a coordinate have no extent there
-    shares = (points - points.min(axis=0)) / np.where(size > 0, size, 1.0)
-    cells = np.minimum((shares * 2**LEVELS).astype(np.int64), 2**LEVELS - 1)
-    keys = np.zeros(len(points), dtype=np.int64)
-    for level in range(LEVELS):
-        for axis in range(3):
-            keys |= ((cells[:, axis] >> level) & 1) << (3 * level + axis)
-    return np.argsort(keys, kind="stable")
 
 
 def build_target(
@@ -204,7 +182,7 @@ def build_target(
     if visibility == "off":
         way: Visibility = NoVisibility()
     elif visibility == "raycast":
-        way = surfaces.raycast(scenes)
+        way = raycast(surfaces, scenes)
     else:
         same = all(body.role == "both" for scene in scenes for body in scene.bodies)
         occluders = field if same else build_field(scenes, lambda body: body.is_occluder, **fields)
