@@ -196,7 +196,7 @@ def _check_boresight(rules: SensorRules, space: DesignSpace, *, are_parts: bool)
         _refuse(f"a roll of at least {low:g} and at most {high:g} degrees", names)
     if not are_parts and (low > MOST_ROLL_DEG or high < -MOST_ROLL_DEG):
         _refuse("beyond 45 degrees a field is the same with its two angles exchanged", names)
-    if not {AZIMUTH, ELEVATION} <= set(space.free) and not low <= 0 <= high:
+    if not space.turns and not low <= 0 <= high:
         _refuse("the roll is 0 where the design space holds all rays in a plane", [*names, "space"])
     ends = [end for end in ("min", "max") if getattr(azimuth, end) is not None]
     if not ends or space.full_azimuth:

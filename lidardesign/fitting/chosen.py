@@ -270,7 +270,7 @@ def smallest_field(sensor: Sensor, looking: np.ndarray, rules: SensorRules, spac
     widest, fields, bounds = np.array(sensor.field_of_view_rad), rules.field_of_view, rules.boresight
     least = np.radians([fields.horizontal_deg.min or 0.0, fields.vertical_deg.min or 0.0])
     ends = (bounds.azimuth_deg.min, bounds.azimuth_deg.max, bounds.elevation_deg.min, bounds.elevation_deg.max)
-    may_turn = all(end is None for end in ends) and {AZIMUTH, ELEVATION} <= set(space.free)
+    may_turn = all(end is None for end in ends) and space.turns
     tried, best, smallest = sensor, sensor, math.inf
     for _ in range(CENTRING_ROUNDS if may_turn else 1):
         tangent = tried.tangent_of(looking)

@@ -108,7 +108,7 @@ def fit_design(
         "seed": request.seed,
         "versions": versions(),
     }
-    weighting = {KEY: request.weighting.as_document()} if request.weighting.settings else {}
+    weighting = {KEY: {"set": list(request.weighting.settings)}} if request.weighting.settings else {}
     world = {WORLD: request.world} if request.world else {}
     with plugin_guard(run.task.name):
         mount = mount_of(run.task, run.config.task)
@@ -386,8 +386,15 @@ class Fitter:
                 )
         elif fitted.rays is not None:
             design = replace(design, constraints=merged(design.constraints, {"budget": {"rays": fitted.rays}}))
-        result = FitResult.of_fit(design, fitted, self.samples, time.perf_counter() - started)
-        return replace(result, notes=(*notes, *result.notes))
+        return FitResult(
+            design,
+            fitted.log_likelihood.value,
+            fitted.admissible_mass,
+            fitted.ess,
+            time.perf_counter() - started,
+            notes=(*notes, *fitted.notes),
+            error_estimates=fitted.estimates(self.samples),
+        )
 
     def _if_better(self, design: DesignSpec, notes: list[str]) -> DesignSpec:
         """The design with its adaptive patterns where they score better on training scenes held back, else without.

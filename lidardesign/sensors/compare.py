@@ -124,16 +124,14 @@ def outside_notes(design: DesignSpec, space: DesignSpace) -> list[str]:
     """
     low, high = np.array(space.low[:3]), np.array(space.high[:3])
     size_m = float(np.linalg.norm(high - low)) + space.high[RANGE]
-    origins_m = np.array([sensor.origin_m for sensor in design.sensors]).reshape(-1, 3)
-    starts_m = np.array([sensor.gate_m[0] for sensor in design.sensors])
-    for pattern in design.patterns:
-        origins_m = np.concatenate([origins_m, pattern.origin_m.reshape(-1, 3)])
-        starts_m = np.concatenate([starts_m, pattern.gate_m[..., 0].reshape(-1)])
+    every = (*design.sensors, *design.patterns)
+    origins_m = np.concatenate([np.reshape(one.origin_m, (-1, 3)) for one in every])
+    starts_m = np.concatenate([np.asarray(one.gate_m)[..., 0].ravel() for one in every])
     unit = "are its lengths in millimetres?"
     apart_m = np.linalg.norm(np.maximum(np.maximum(origins_m - high, low - origins_m), 0.0), axis=1)
-    if len(apart_m) and apart_m.max() > FAR_SIZES * size_m:
+    if apart_m.max() > FAR_SIZES * size_m:
         return [f"{design.name} stands {apart_m.max():.4g} m outside the run's design space; {unit}"]
-    if len(starts_m) and starts_m.max() > FAR_SIZES * size_m:
+    if starts_m.max() > FAR_SIZES * size_m:
         return [
             f"{design.name} listens from {starts_m.max():.4g} m, but the run's design space ends at "
             f"{space.high[RANGE]:.4g} m; {unit}"

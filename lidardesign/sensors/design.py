@@ -119,18 +119,12 @@ class DesignSpec:
         """Rays of each sensor in its largest pattern, shape (S,)."""
         return self.patterns[-1].per_sensor(len(self.sensors))
 
-    def rays(
-        self,
-        count: int | None = None,
-        at: Mapping[str, float] | None = None,
-        rate_hz: float = DEFAULT_RATE_HZ,
-    ) -> Rays:
+    def rays(self, count: int | None = None, at: Mapping[str, float] | None = None) -> Rays:
         """The rays that it fires, evenly over a frame: the one source of a design's rays.
 
         Arguments:
             count: Rays per frame; None takes its own number.
             at: Condition values, as {"x_m": 0.37}: patterns along a condition are evaluated, others are moved.
-            rate_hz: Frames per second [Hz].
 
         Raises:
             ConfigError: It cannot fire so many rays, has no number of its own, or cannot be at this condition.
@@ -139,8 +133,7 @@ class DesignSpec:
         if count is None:
             raise ConfigError("the design names no number of rays", where=self.name, hint="give --rays N")
         here = self.at_condition(at or {}) if at or self.condition else self
-        rays = here._rays(count)
-        return rays if rate_hz == DEFAULT_RATE_HZ else replace(rays, time_s=fire_times(len(rays), rate_hz))
+        return here._rays(count)
 
     def _rays(self, count: int) -> Rays:
         pattern = self.pattern(count)

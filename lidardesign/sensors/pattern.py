@@ -65,6 +65,9 @@ class Pattern:
             lists: The rays at each knot, equal numbers of each sensor.
             ends: First and last value of the pattern, which enclose the knots.
         """
+        # slow to import
+        from scipy.optimize import linear_sum_assignment
+
         order = np.argsort(knots)
         rays = [lists[order[0]]]
         for place in order[1:]:
@@ -73,7 +76,8 @@ class Pattern:
             taken = np.empty(len(before), dtype=np.intp)
             for sensor in np.unique(before):
                 mine, theirs = np.flatnonzero(before == sensor), np.flatnonzero(after == sensor)
-                taken[mine] = theirs[_assigned(aims[0][mine], aims[1][theirs])]
+                moves = np.square(aims[0][mine][:, None] - aims[1][theirs][None]).sum(axis=2)
+                taken[mine] = theirs[linear_sum_assignment(moves)[1]]
             rays.append(lists[place].subset(taken))
         places = np.array(knots, dtype=np.float64)[order].tolist()
         if ends[0] < places[0]:
@@ -164,14 +168,6 @@ def with_coordinates(origin_m: np.ndarray, values: Mapping[int, float]) -> np.nd
     for axis, value in values.items():
         moved[..., axis] = value
     return moved
-
-
-def _assigned(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """The index in `after` (N, 3) of each point of `before` (N, 3), with the least sum of squared moves."""
-    # slow to import
-    from scipy.optimize import linear_sum_assignment
-
-    return linear_sum_assignment(np.square(before[:, None] - after[None]).sum(axis=2))[1]
 
 
 def even_rays(sensors: Sequence[Sensor], counts: Sequence[int]) -> Rays:

@@ -82,13 +82,11 @@ def log_proposal(target: Target, points: np.ndarray) -> np.ndarray | None:
 
 
 def _are_resampled(space: DesignSpace) -> bool:
-    both_angles = AZIMUTH in space.free and ELEVATION in space.free
-    return RANGE not in space.free or (not both_angles and len(space.free) <= RESAMPLED_DIMENSIONS)
+    return RANGE not in space.free or (not space.turns and len(space.free) <= RESAMPLED_DIMENSIONS)
 
 
 def _are_drawn_by_surfaces(target: Target) -> bool:
-    free = target.space.free
-    return RANGE in free and AZIMUTH in free and ELEVATION in free and target.surfaces.can_propose
+    return RANGE in target.space.free and target.space.turns and target.surfaces.can_propose
 
 
 def _is_near(target: Target, log_proximity: np.ndarray) -> np.ndarray:
@@ -157,10 +155,9 @@ def propose(
     columns = scene_columns(scenes)
     if len(columns) > MAXIMUM_COLUMNS:
         columns = [columns[i] for i in sorted(generator.choice(len(columns), MAXIMUM_COLUMNS, replace=False))]
-    angles_free = AZIMUTH in space.free and ELEVATION in space.free
-    draw = _from_aimed_rays if angles_free else _from_random_rays
+    draw = _from_aimed_rays if space.turns else _from_random_rays
     points, surface_range, column, density = draw(scenes, columns, space, count, spread_m, generator)
-    if angles_free and space.measure == "angles":
+    if space.turns and space.measure == "angles":
         density *= np.cos(points[:, ELEVATION])
     usable = np.flatnonzero(space.contains(points) & (density > 0))
     return ProposedPoints(points[usable], np.log(density[usable]), surface_range[usable], column[usable], columns)
