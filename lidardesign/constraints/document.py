@@ -20,7 +20,7 @@ Entries of `each` apply to the first, second, ... sensor over the common keys.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -36,7 +36,7 @@ from lidardesign.run.validation import (
     parse_overrides,
     placed_at,
 )
-from lidardesign.run.yaml import Document, KeyPath, leaves, load_yaml
+from lidardesign.run.yaml import Document, KeyPath, leaves, load_yaml, merged
 from lidardesign.run_folder import Notes, log_note
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design_file import Distance, Vector
@@ -324,30 +324,15 @@ class Constraints(SensorConstraints):
         for index, entry in enumerate([*self.each, SensorConstraints()]):
             own = entry.model_dump(exclude_none=True)
             resolved = SensorConstraints.model_validate(merged(common, own))
-            keys = frozenset(_key_paths(own)) if index < len(self.each) else frozenset()
-            rules.append(SensorRules(**dict(resolved), index=index, own_keys=keys))
+            # the keys at every depth, joined by dots
+            paths = [list(map(str, path)) for path, _ in leaves(own)]
+            keys = {".".join(path[:depth]) for path in paths for depth in range(1, len(path) + 1)}
+            rules.append(SensorRules(**dict(resolved), index=index, own_keys=frozenset(keys)))
         return tuple(rules)
 
     def as_document(self) -> dict[str, Any]:
         """The plain values that were given, for the design file."""
         return self.model_dump(exclude_none=True, exclude_unset=True, exclude=None if self.survive else {"survive"})
-
-
-def merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """Plain values overridden by others, key by key at every depth."""
-    result = dict(base)
-    for key, value in over.items():
-        both = isinstance(value, Mapping) and isinstance(result.get(key), dict)
-        result[key] = merged(result[key], value) if both else value
-    return result
-
-
-def _key_paths(values: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
-    """The keys of plain values at every depth, joined by dots."""
-    for key, value in values.items():
-        yield prefix + key
-        if isinstance(value, Mapping):
-            yield from _key_paths(value, f"{prefix}{key}.")
 
 
 def split_settings(overrides: Sequence[str], task: Task) -> tuple[list[str], list[str]]:

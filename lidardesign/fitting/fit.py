@@ -23,7 +23,7 @@ import numpy as np
 
 from lidardesign.config import FILE_NAME, with_task_settings
 from lidardesign.constraints.check import ConstraintCheck, check_design
-from lidardesign.constraints.document import Constraints, merged
+from lidardesign.constraints.document import Constraints
 from lidardesign.constraints.feasibility import check_feasible
 from lidardesign.constraints.origins import placement_notes
 from lidardesign.errors import BackgroundNote, DataError, InfeasibleError
@@ -38,7 +38,7 @@ from lidardesign.rays.training import CHOICE, TrainingScenes
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.run.manifest import read_manifest, versions
-from lidardesign.run.yaml import dump_yaml, parse_yaml
+from lidardesign.run.yaml import dump_yaml, merged, parse_yaml
 from lidardesign.run_folder import Notes, RunFolder, ignore, log_note
 from lidardesign.samples import Samples, load_samples
 from lidardesign.sensors.design import DesignSpec
@@ -451,8 +451,7 @@ class Fitter:
     def _parts(self, request: FitRequest, notes: Notes) -> FitResult:
         from lidardesign.fitting.part_design import choose_parts
 
-        informs = partial(checked_information, request.run.task)
-        return choose_parts(self.samples, request, self.training, informs, notes, self.progress)
+        return choose_parts(self.samples, request, self.training, notes, self.progress)
 
     def _rings(self) -> FitResult:
         from lidardesign.fitting.spinning import CHANNELS, choose_rings

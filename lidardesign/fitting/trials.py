@@ -14,13 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from lidardesign.constraints.document import Constraints, merged
+from lidardesign.constraints.document import Constraints
 from lidardesign.errors import BackgroundNote, InfeasibleError
 from lidardesign.estimates import Interval, mean_interval
 from lidardesign.fitting.request import FitRequest
 from lidardesign.rays.information import FEW_SCENES, MOST_SCENES
 from lidardesign.rays.selection import SHARE_PER_BANDWIDTH
 from lidardesign.rays.training import HELD_BACK, TrainingScenes
+from lidardesign.run.yaml import merged
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Scene, group_numbers
 from lidardesign.scoring.scene_scores import score_lists, without_each

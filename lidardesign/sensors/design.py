@@ -133,16 +133,13 @@ class DesignSpec:
         if count is None:
             raise ConfigError("the design names no number of rays", where=self.name, hint="give --rays N")
         here = self.at_condition(at or {}) if at or self.condition else self
-        return here._rays(count)
-
-    def _rays(self, count: int) -> Rays:
-        pattern = self.pattern(count)
+        pattern = here.pattern(count)
         if pattern is not None:
             return pattern.at()
         if self.layout == "even":
-            return even_rays(self.sensors, split_budget(self.weights, count, each=True))
+            return even_rays(here.sensors, split_budget(self.weights, count, each=True))
         if self.size is not None and count <= self.size:
-            table = self.patterns[-1].at()
+            table = here.patterns[-1].at()
             shares = split_budget(self._own_counts, count)
             own = [np.flatnonzero(table.sensor == index) for index in range(len(shares))]
             chosen = [rows[even_subset(table.direction[rows], int(n))] for rows, n in zip(own, shares, strict=True)]

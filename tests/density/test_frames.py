@@ -10,8 +10,8 @@ import trimesh
 from support import references
 
 from lidardesign.config import DensitySettings
-from lidardesign.density.fields.bodies import Pairs, collect_bodies, occluding_bodies
-from lidardesign.density.fields.distance import BodyField
+from lidardesign.density.fields.bodies import Pairs, occluding_bodies
+from lidardesign.density.fields.distance import BodyField, build_field
 from lidardesign.density.objective.proposals import independent_points
 from lidardesign.density.objective.surfaces import MovingFrames
 from lidardesign.density.objective.target import build_target
@@ -140,7 +140,7 @@ def test_parts_of_all_frames_average_to_the_whole():
 
 def test_bodies_are_found_by_their_boxes_as_by_looking_at_all():
     scenes = moving_scenes(frames=4)
-    bodies = collect_bodies(scenes, lambda body: not isinstance(body.shape, Plane), resolution=24, padding_m=0.1)
+    bodies = build_field(scenes, lambda body: not isinstance(body.shape, Plane), resolution=24, padding_m=0.1).bodies
     points = np.random.default_rng(5).uniform(-0.6, 0.8, (400, 3))
     everything = BodyField(bodies).distances(points)
     from lidardesign.density.objective.surfaces import near_pairs

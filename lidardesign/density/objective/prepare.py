@@ -83,7 +83,7 @@ def prepare_target(
     visibility = visibility or settings.visibility
     if visibility == "auto":
         visibility, reason = _choose_visibility(scenes, config)
-        notes.append(reason)
+        notes.append(BackgroundNote(reason))
     target = build_target(scenes, config.space, settings, visibility, compiled=compiled)
     if visibility == "quadrature":
         generator = random_generator(config.seed, "quadrature")
@@ -107,14 +107,11 @@ def _choose_visibility(scenes: Sequence[Scene], config: RunConfig) -> tuple[str,
     optics = Optics.of(config.density)
     proposals = propose(scenes, config.space, PROBES, optics.sigma_m, generator)
     if not len(proposals.points):
-        reason = "visibility by ray casting, to be safe: no probed ray of the design space meets a target"
-        return "raycast", BackgroundNote(reason)
+        return "raycast", "visibility by ray casting, to be safe: no probed ray of the design space meets a target"
     share = occluded_share(scenes, proposals, optics.margin_m + 3 * optics.sigma_m)
     if share < OCCLUDED_SHARE_TO_CARE:
-        reason = f"visibility off: {share:.2%} of {len(proposals.points)} probed rays had anything in the way"
-        return "off", BackgroundNote(reason)
-    reason = f"visibility by ray casting: {share:.1%} of {len(proposals.points)} probed rays were occluded"
-    return "raycast", BackgroundNote(reason)
+        return "off", f"visibility off: {share:.2%} of {len(proposals.points)} probed rays had anything in the way"
+    return "raycast", f"visibility by ray casting: {share:.1%} of {len(proposals.points)} probed rays were occluded"
 
 
 def refine_quadrature(target: Target, probes: np.ndarray) -> tuple[Target, list[str]]:

@@ -15,9 +15,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lidardesign.config import DensitySettings
-from lidardesign.density.fields.bodies import collect_bodies
 from lidardesign.density.fields.distance import TableField, build_field, scene_columns
-from lidardesign.density.fields.importance import BodyWeights, build_log_weights, is_weighted, weigh
+from lidardesign.density.fields.importance import build_log_weights
 from lidardesign.density.objective.quadrature import Quadrature
 from lidardesign.density.objective.surfaces import MovingFrames, SceneTable, Surfaces, raycast
 from lidardesign.density.objective.visibility import (
@@ -157,28 +156,24 @@ def build_target(
     # meshes at rest are best kept in the table that all scenes at rest share
     at_rest = [body for scene in scenes if scene.frames == 1 for body in scene.bodies if body.is_target]
     tabled = visibility == "quadrature" or any(isinstance(body.shape, Mesh) for body in at_rest)
+    moving = sum(scene.frames * len(scene.bodies) for scene in scenes if scene.frames > 1)
+    if visibility == "quadrature" and moving > MOST_QUADRATURE_BODIES:
+        # every body of thousands of frames would be evaluated at every midpoint
+        raise ConfigError(
+            f"a quadrature over {moving} bodies in all frames would take minutes per step",
+            where="density.visibility",
+            allowed=f"at most {MOST_QUADRATURE_BODIES}",
+            hint="density.visibility=raycast looks only at the frames that matter",
+        )
+    field = build_field(scenes, lambda body: body.is_target, **fields)
+    if isinstance(field, TableField):
+        field = replace(field, compiled=compiled)
+    importance = build_log_weights(scenes, field)
     if common_receiver(scenes) is None and not tabled:
-        bodies = collect_bodies(scenes, lambda body: body.is_target, **fields)
-        importance = None
-        if is_weighted(scenes):
-            entries = [body for scene in scenes for _ in range(scene.frames) for body in scene.bodies if body.is_target]
-            bodies = weigh(bodies, entries)
-            importance = BodyWeights(bodies)
+        bodies = field.bodies if importance is None else importance.bodies
         surfaces: Surfaces = MovingFrames(bodies, log_column_weights, importance)
     else:
-        moving = sum(scene.frames * len(scene.bodies) for scene in scenes if scene.frames > 1)
-        if visibility == "quadrature" and moving > MOST_QUADRATURE_BODIES:
-            # every body of thousands of frames would be evaluated at every midpoint
-            raise ConfigError(
-                f"a quadrature over {moving} bodies in all frames would take minutes per step",
-                where="density.visibility",
-                allowed=f"at most {MOST_QUADRATURE_BODIES}",
-                hint="density.visibility=raycast looks only at the frames that matter",
-            )
-        field = build_field(scenes, lambda body: body.is_target, **fields)
-        if isinstance(field, TableField):
-            field = replace(field, compiled=compiled)
-        surfaces = SceneTable(field, log_column_weights, build_log_weights(scenes, field))
+        surfaces = SceneTable(field, log_column_weights, importance)
     if visibility == "off":
         way: Visibility = NoVisibility()
     elif visibility == "raycast":

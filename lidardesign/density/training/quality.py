@@ -106,10 +106,8 @@ def coverage(
 ) -> Estimate:
     """The covered share of the target's mass, from proposals with their three log densities, shapes (N,).
 
-    With conditions `log_z` has the value of each proposal's condition group, shape (N,). No proposals cover nothing.
+    With conditions `log_z` has the value of each proposal's condition group, shape (N,).
     """
-    if not len(log_target):
-        return Estimate(0.0, None)
     log_mass = log_target - log_proposal
     mass = np.exp(log_mass - log_mass.max())
     covered = log_prob >= log_target - log_z + math.log(COVERED_RATIO)
