@@ -232,6 +232,6 @@ def test_a_quadrature_over_thousands_of_bodies_is_refused():
 def test_a_frame_costs_a_pose_and_no_grid_even_where_scenes_have_copies_of_a_mesh():
     generator = np.random.default_rng(0)
     scenes = [Scene((Body(cube(generator), "part", "target", tracks(generator, 250)),)) for _ in range(2)]
-    bodies = collect_bodies(scenes, lambda body: True, resolution=16, padding_m=0.05)
+    bodies = build_field(scenes, lambda body: True, resolution=16, padding_m=0.05).bodies
     assert bodies.columns == 500
     assert len(bodies.grids.meshes) == 1

@@ -191,7 +191,10 @@ def occluding_bodies(scenes: Sequence[Scene]) -> Bodies:
     """The occluders of all scenes and frames; their meshes are only cast at, so they have no distance grids."""
     columns = [(scene, frame) for scene in scenes for frame in range(scene.frames)]
     entries = [
-        (c, body, frame) for c, (scene, frame) in enumerate(columns) for body in scene.bodies if body.is_occluder
+        (column, body, frame)
+        for column, (scene, frame) in enumerate(columns)
+        for body in scene.bodies
+        if body.is_occluder
     ]
     return place_bodies(entries, len(columns), _no_distances)
 
