@@ -11,29 +11,23 @@ from __future__ import annotations
 import bisect
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import numpy as np
 
 from lidardesign.constraints.document import MOST_ROLL_DEG, Constraints, SensorRules
 from lidardesign.constraints.origins import free_boxes, most_mounted, mounts_of, snap_place_to_space
 from lidardesign.errors import InfeasibleError
-from lidardesign.numerics import COARSE_SLACK, SLACK
+from lidardesign.numerics import SLACK
 from lidardesign.run.yaml import leaves
 from lidardesign.sensors.bandwidth import Bandwidth, split_budget
 from lidardesign.space import AZIMUTH, DIMENSIONS, ELEVATION, RANGE, DesignSpace
 
 # Bounds that differ by less come from the same number through degrees and radians [m or rad].
 AGREEMENT = SLACK
-# A cap of n bins is this share narrower, so that its width never rounds up to n + 1 bins.
-BIN_MARGIN = COARSE_SLACK
-MOST_REFITS = 12
 # Lengths beyond so many times the space, and smaller fields of view, are probably in another unit.
 DOUBTFUL_TIMES, DOUBTFUL_DEG = 10.0, 1.0
-
-Fitted = TypeVar("Fitted")
 
 
 @dataclass(frozen=True)
@@ -363,51 +357,7 @@ class BandwidthBudget:
         return max(rays, len(widths_m))
 
 
-def fit_within_budget(
-    fitted: Fitted,
-    refit: Callable[[Fitted, float], Fitted],
-    shape: Callable[[Fitted], tuple[np.ndarray, np.ndarray]],
-    budget: BandwidthBudget,
-) -> tuple[Fitted, int | None]:
-    """A fit that keeps the bandwidth budget, and its number of rays.
-
-    Where the fit is too expensive its gates are narrowed to a common number of bins and it is refitted from
-    where it was, until the count of whole bins keeps the budget.
-
-    Arguments:
-        fitted: The fit without a budget.
-        refit: Continues a fit with gates no wider than a cap [m].
-        shape: Gate widths [m] and weights of a fit, shape (K,) each.
-        budget: Budget and bandwidth model.
-
-    Raises:
-        InfeasibleError: Even the narrowest admitted gates exceed the budget.
-    """
-    widths, weights = shape(fitted)
-    if budget.limit_mbps is None:
-        return fitted, budget.rays
-    rays = budget.rays if budget.rays is not None else budget.affordable_rays(widths, weights)
-    if budget.fits(widths, weights, rays):
-        return fitted, rays
-    bins = _affordable_bins(budget, widths, weights, rays)
-    for _ in range(MOST_REFITS):
-        fitted = refit(fitted, (1 - BIN_MARGIN) * max(bins, 1) * budget.model.bin_m)
-        widths, weights = shape(fitted)
-        if budget.fits(widths, weights, rays):
-            return fitted, rays
-        if bins <= 1:
-            break
-        bins = min(bins - 1, _affordable_bins(budget, widths, weights, rays))
-    needed = budget.mbps(widths, weights, rays)
-    raise InfeasibleError(
-        f"{rays} rays still need {needed:g} Mbit/s with the narrowest gates that the other constraints allow",
-        conflicts=["budget.bandwidth_mbps", *budget.names],
-        allowed=f"at most {budget.limit_mbps:g} Mbit/s",
-        hint="fewer rays, narrower gates, or more bandwidth",
-    )
-
-
-def _affordable_bins(budget: BandwidthBudget, widths: np.ndarray, weights: np.ndarray, rays: int) -> int:
+def affordable_bins(budget: BandwidthBudget, widths: np.ndarray, weights: np.ndarray, rays: int) -> int:
     """The largest common cap in bins that keeps the budget with the present weights, at least 1."""
     counts = split_budget(weights, rays, each=True)
     bins = budget.model.bins(widths)

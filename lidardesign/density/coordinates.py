@@ -205,11 +205,6 @@ def on_device(target: Target, device: torch.device) -> Target:
     return DeviceTarget(**{part.name: getattr(target, part.name) for part in fields(target)}, device=device)
 
 
-def stays_on(target: Target, device: torch.device) -> bool:
-    """True where steps of a flow on a device evaluate the target on the same device."""
-    return device.type == "cpu" or isinstance(target, DeviceTarget)
-
-
 class _LogTarget(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, unit: Tensor, target: Target, coordinates: Coordinates, sigma_m: float) -> Tensor:

@@ -30,6 +30,7 @@ from lidardesign.rays.proposals import (
     LEAST_CANDIDATES_OF_REGIONS,
     Proposals,
     first_candidates,
+    owners,
     rays_of_points,
 )
 from lidardesign.rays.selection import Selected, Selection, inform_enough, select
@@ -223,7 +224,8 @@ def _picked(
     number, known, lists = np.full(len(pool.points), -1), 0, []
     for visit, at in zip(pool.visits, conditions, strict=True):
         sensors, points = proposals.sensors_at(at), pool.points[visit]
-        owner, fired = proposals.owners(sensors, points, proposals.samples.space.at(at))
+        space = proposals.samples.space.at(at)
+        owner, fired = owners(sensors, proposals.rules, proposals.level, points, space, by_turns=proposals.by_turns)
         inside = np.flatnonzero(owner >= 0)
         chosen = inside[first_candidates(owner[inside], count, least)]
         if len(chosen) < count or (np.bincount(owner[chosen], minlength=len(least)) < least).any():

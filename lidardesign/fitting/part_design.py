@@ -172,7 +172,8 @@ def choose_parts(
         unit=trained[0].unit,
     )
     design = replace(winner.design, certificates=(certificate,))
-    return replace(FitResult.of_choice(design, samples, perf_counter() - started), numbers=tuple(rows))
+    seconds = perf_counter() - started
+    return FitResult(design, None, None, samples.effective_sample_size, seconds, numbers=tuple(rows))
 
 
 def _sets_by_number(
@@ -522,15 +523,18 @@ def _design(name: str, constraints: Constraints, placed: Sequence[PlacedPart], r
         )
     counts = split_budget(np.array(patterns), total).tolist()
     tables = [part_rays(one.part, one.pose, count) for one, count in zip(placed, counts, strict=True)]
-    sensors = []
-    for index, (one, count) in enumerate(zip(placed, counts, strict=True)):
-        start, end = one.shape.gate_m
-        sensor = part_sensor(one.part, one.pose, name=f"s{index}", weight=count / total)
-        sensors.append(replace(sensor, gate_m=(start, end)))
-    gates = [np.tile(one.shape.gate_m, (count, 1)) for one, count in zip(placed, counts, strict=True)]
+    sensors = [
+        replace(part_sensor(one.part, one.pose, name=f"s{index}", weight=count / total), gate_m=one.shape.gate_m)
+        for index, (one, count) in enumerate(zip(placed, counts, strict=True))
+    ]
     fired = [
-        replace(rays, gate_m=gate_m, sensor=np.full(len(rays), index), time_s=np.zeros(len(rays)))
-        for index, (rays, gate_m) in enumerate(zip(tables, gates, strict=True))
+        replace(
+            rays,
+            gate_m=np.tile(one.shape.gate_m, (len(rays), 1)),
+            sensor=np.full(len(rays), index),
+            time_s=np.zeros(len(rays)),
+        )
+        for index, (one, rays) in enumerate(zip(placed, tables, strict=True))
     ]
     return DesignSpec(
         name=name,

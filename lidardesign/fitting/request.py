@@ -28,7 +28,6 @@ from lidardesign.formats.rig import moved_notes, rig_constraints, rig_notes
 from lidardesign.rays.information import informs_rays
 from lidardesign.run.manifest import read_manifest
 from lidardesign.run_folder import Notes, RunFolder, log_note, settings_texts
-from lidardesign.samples import Samples
 from lidardesign.sensors.design import FITTED_LAYOUTS, DesignSpec, Gates, LayoutName
 from lidardesign.sensors.pattern import TRAVELLED
 from lidardesign.space import DIMENSIONS, DesignSpace
@@ -423,8 +422,8 @@ class FitResult:
     Arguments:
         design: The design.
         log_likelihood: Weighted mean log density of the samples [nats]; None where it was chosen on scenes alone.
-        admissible_mass: The share of the density inside the constraints; None with fixed origins.
-        ess: Effective share of the samples that were admitted, 0 to 1.
+        admissible_mass: The share of the density inside the constraints; None with fixed origins, or likewise.
+        ess: Effective share of the samples that were admitted, or of all where it was chosen on scenes alone, 0 to 1.
         seconds: Wall time [s].
         constraints: The independent checks.
         notes: Lines on sensors.
@@ -443,11 +442,6 @@ class FitResult:
     numbers: tuple[Mapping[str, Any], ...] = ()
     error_estimates: Mapping[str, Estimate] = field(default_factory=dict)
     goal: Mapping[str, Any] | None = None
-
-    @classmethod
-    def of_choice(cls, design: DesignSpec, samples: Samples, seconds: float) -> FitResult:
-        """A design that was chosen on scenes instead of being fitted to samples."""
-        return cls(design, None, None, samples.effective_sample_size, seconds)
 
     @property
     def satisfied(self) -> bool:

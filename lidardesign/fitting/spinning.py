@@ -184,7 +184,7 @@ def choose_rings(
         certificates=(certificate,),
         provenance={"channels": channels},
     )
-    return FitResult.of_choice(design, samples, perf_counter() - started)
+    return FitResult(design, None, None, samples.effective_sample_size, perf_counter() - started)
 
 
 def ring_grid(space: DesignSpace, rays: int | None, count: int, channels: int) -> tuple[np.ndarray, int]:

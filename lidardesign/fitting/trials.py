@@ -363,8 +363,8 @@ class GoalSearch:
 
     def _with_rays(self, rays: int) -> FitRequest:
         """The request with a number of rays, whatever number its constraints name."""
-        bound = {} if self.request.constraints.budget.rays is None else {"rays": rays}
-        return _with_budget(replace(self.request, rays=rays), bound)
+        request = replace(self.request, rays=rays)
+        return request if request.constraints.budget.rays is None else _with_budget(request, {"rays": rays})
 
     def _least_bandwidth(self, rays: int, limit: float) -> float:
         """The least bandwidth below a limit in which so many rays keep the goal; the limit where there is none."""
@@ -429,5 +429,5 @@ def rounded_up(mbps: float) -> float:
 
 
 def _with_budget(request: FitRequest, budget: dict[str, float]) -> FitRequest:
-    document = merged(request.constraints.as_document(), {"budget": budget}) if budget else None
-    return request if document is None else replace(request, constraints=Constraints.from_mapping(document))
+    document = merged(request.constraints.as_document(), {"budget": budget})
+    return replace(request, constraints=Constraints.from_mapping(document))

@@ -99,7 +99,9 @@ class Ensemble:
         results = []
         for part, result in zip(self.parts, self.results, strict=True):
             bounds = part.bounds.narrowed(width_m)
-            start = admitted_mixture(result.mixture, part.features, bounds)
+            # one M-step from its own statistics takes the fit inside other bounds
+            statistics, floors = expect(result.mixture, part.features), Floors.of(part.features)
+            start = maximise(result.mixture, statistics, part.features, bounds, floors, 0.0)
             results.append(replace(run_em(start, part.features, bounds), notes=result.notes))
         return Ensemble(self.parts, tuple(results))
 
@@ -112,11 +114,6 @@ def fit_groups(parts: Sequence[GroupSamples], seed: int, restarts: int) -> Ensem
         for index, part in enumerate(parts)
     ]
     return Ensemble(tuple(parts), tuple(results))
-
-
-def admitted_mixture(mixture: Mixture, features: Features, bounds: Bounds) -> Mixture:
-    """The parameters of a fit inside other bounds: one M-step from its own statistics."""
-    return maximise(mixture, expect(mixture, features), features, bounds, Floors.of(features), 0.0)
 
 
 def sensors_of(ensemble: Ensemble, space: DesignSpace) -> tuple[Sensor, ...]:

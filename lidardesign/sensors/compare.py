@@ -7,7 +7,7 @@ where a metre of place and of gate counts as much as a radian at the designs' ra
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -94,9 +94,8 @@ class BandwidthUse:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for scripts."""
-        model = {name: getattr(self.model, name) for name in MODEL_KEYS}
         rays = {"rays": self.rays, "of_one_ray": self.rays is None}
-        return {"low_mbps": self.low_mbps, "high_mbps": self.high_mbps, **rays, **model}
+        return {"low_mbps": self.low_mbps, "high_mbps": self.high_mbps, **rays, **asdict(self.model)}
 
 
 def readout_of(design: DesignSpec) -> BandwidthUse:

@@ -193,19 +193,6 @@ class DesignSpec:
         Raises:
             ConfigError: A name that is no coordinate, a value beyond the ends of a pattern, or none where rays differ.
         """
-        moves, here = self._moves(at), {**self.at, **at}
-        sensors = tuple(replace(sensor, origin_m=with_coordinates(sensor.origin_m, moves)) for sensor in self.sensors)
-        if self.condition is None:
-            patterns = tuple(
-                replace(pattern, origin_m=with_coordinates(pattern.origin_m, moves)) for pattern in self.patterns
-            )
-        else:
-            patterns = tuple(Pattern.of(pattern.at(at.get(self.condition))) for pattern in self.patterns)
-        kept = self.certificates if here == self.at or self.condition is not None else ()
-        return replace(self, sensors=sensors, patterns=patterns, at=here, certificates=kept)
-
-    def _moves(self, at: Mapping[str, float]) -> dict[int, float]:
-        """The new coordinates of origins by axis; conditions other than origins cannot change."""
         for name, value in at.items():
             if name not in DIMENSIONS:
                 raise ConfigError(
@@ -221,7 +208,17 @@ class DesignSpec:
                     allowed=f"{name}={self.at[name]:g}" if name in self.at else ", ".join(allowed),
                     hint=f"lidardesign fit RUN --at {name}={value:g}",
                 )
-        return {DIMENSIONS.index(name): float(value) for name, value in at.items() if name in TRAVELLED}
+        here = {**self.at, **at}
+        moves = {DIMENSIONS.index(name): float(value) for name, value in at.items() if name in TRAVELLED}
+        sensors = tuple(replace(sensor, origin_m=with_coordinates(sensor.origin_m, moves)) for sensor in self.sensors)
+        if self.condition is None:
+            patterns = tuple(
+                replace(pattern, origin_m=with_coordinates(pattern.origin_m, moves)) for pattern in self.patterns
+            )
+        else:
+            patterns = tuple(Pattern.of(pattern.at(at.get(self.condition))) for pattern in self.patterns)
+        kept = self.certificates if here == self.at or self.condition is not None else ()
+        return replace(self, sensors=sensors, patterns=patterns, at=here, certificates=kept)
 
 
 # A bound that leaves more of the loss open than this certifies nothing that anyone would act on.

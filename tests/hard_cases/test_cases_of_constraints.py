@@ -23,10 +23,10 @@ from lidardesign.constraints.check import check_design
 from lidardesign.constraints.document import Constraints
 from lidardesign.constraints.feasibility import check_feasible
 from lidardesign.errors import InfeasibleError
-from lidardesign.mixture.bounds import Bounds
-from lidardesign.mixture.components import Axes, Features, log_density
+from lidardesign.mixture.bounds import Bounds, Floors
+from lidardesign.mixture.components import Axes, Features, expect, log_density
 from lidardesign.mixture.em import fit_mixture
-from lidardesign.mixture.ensemble import admitted_mixture
+from lidardesign.mixture.m_step import maximise
 from lidardesign.mixture.support import LEAST_MASS
 from lidardesign.samples import Samples
 from lidardesign.scoring.metrics import DRAW_ROUNDS
@@ -362,7 +362,8 @@ def clamp_and_mstep():
     features = Features.of(points, np.ones(2000), Axes.of(space), space)
     start = fit_mixture(features, Bounds.unbounded(2, Z), np.random.default_rng(1))
     two = Bounds.unbounded(2, Z).narrowed(0.2)
-    clamped = admitted_mixture(start.mixture, features, Bounds.unbounded(2, Z))
+    statistics = expect(start.mixture, features)
+    clamped = maximise(start.mixture, statistics, features, Bounds.unbounded(2, Z), Floors.of(features), 0.0)
     rows = {name: getattr(clamped, name).copy() for name in clamped.__dataclass_fields__}
     rows["spread_range_m"] = np.minimum(rows["spread_range_m"], 0.2 / (2 * Z))
     after = float(features.weights @ log_density(type(clamped)(**rows), features))

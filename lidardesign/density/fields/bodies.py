@@ -182,10 +182,6 @@ class Bodies:
         fields = {name: getattr(self, name)[rows] for name in names}
         return replace(self, **fields, column=np.repeat(np.arange(len(columns)), counts), starts=starts)
 
-    def apart(self) -> Bodies:
-        """The same bodies, each in its own column."""
-        return replace(self, column=np.arange(len(self)), starts=np.arange(len(self) + 1))
-
 
 def occluding_bodies(scenes: Sequence[Scene]) -> Bodies:
     """The occluders of all scenes and frames; their meshes are only cast at, so they have no distance grids."""

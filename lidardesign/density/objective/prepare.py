@@ -94,7 +94,7 @@ def prepare_target(
     return target, [
         *notes,
         *resolution_notes(target, settings),
-        *flatness_notes(target, settings.sigma_m, random_generator(config.seed, "flatness")),
+        *flatness_notes(target, random_generator(config.seed, "flatness")),
         *importance_notes(scenes),
         *dict.fromkeys(line for scene in scenes for line in scene.notes),
         *sorted({line for shape in shapes for line in getattr(shape, "notes", ())}),
@@ -195,12 +195,12 @@ def resolution_notes(target: Target, settings: DensitySettings) -> list[str]:
     ]
 
 
-def flatness_notes(target: Target, sigma_m: float, generator: np.random.Generator) -> list[str]:
+def flatness_notes(target: Target, generator: np.random.Generator) -> list[str]:
     """A note where a sigma wider than the observable region leaves the density flat over uniform points."""
-    points = target.space.sample(FLATNESS_PROBES, generator)
+    points, sigma_m = target.space.sample(FLATNESS_PROBES, generator), target.optics.sigma_m
     if not target.space.free or sigma_m < float(np.linalg.norm(np.ptp(observed_point(points), axis=0))):
         return []
-    varies = float(np.ptp(target.log_proximity(points, sigma_m)))
+    varies = float(np.ptp(target.log_proximity(points)))
     if varies >= FLAT_NATS:
         return []
     return [

@@ -270,7 +270,8 @@ class MovingFrames:
     ) -> np.ndarray:
         """See `SceneTable`."""
         # each body has a term of its own, also where several are in one column
-        bodies, weights = self.bodies.apart(), self.log_column_weights[self.bodies.column]
+        count, weights = len(self.bodies), self.log_column_weights[self.bodies.column]
+        bodies = replace(self.bodies, column=np.arange(count), starts=np.arange(count + 1))
         observed, log_density = observed_point(points), np.empty(len(points))
         for start in range(0, len(points), PROPOSALS_AT_ONCE):
             rows = slice(start, min(start + PROPOSALS_AT_ONCE, len(points)))

@@ -78,13 +78,12 @@ class Target:
         """An estimate of p* from some columns alone, weighted to stand for all; the others need no visibility."""
         return replace(self, surfaces=self.surfaces.subsample(columns), visibility=self.visibility.take(columns))
 
-    def log_proximity(self, points: np.ndarray, sigma_m: float | None = None) -> np.ndarray:
+    def log_proximity(self, points: np.ndarray) -> np.ndarray:
         """log of the sum of surface terms at the scene points that design points (N, 6) observe, shape (N,)."""
-        sigma_m = self.optics.sigma_m if sigma_m is None else sigma_m
         observed, values = observed_point(points), np.empty(len(points))
         for start in range(0, len(points), self.rows_at_once):
             rows = slice(start, start + self.rows_at_once)
-            values[rows] = self.surfaces.log_proximity(observed[rows], sigma_m, self.surface_tolerance_nats)
+            values[rows] = self.surfaces.log_proximity(observed[rows], self.optics.sigma_m, self.surface_tolerance_nats)
         return values
 
     def log_density(self, points: np.ndarray, sigma_m: float | None = None) -> np.ndarray:

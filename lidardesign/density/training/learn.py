@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from lidardesign.config import PRESET_LEARNING, RunConfig
-from lidardesign.density.coordinates import Coordinates, on_device, stays_on
+from lidardesign.density.coordinates import Coordinates, DeviceTarget, on_device
 from lidardesign.density.network import DesignFlow
 from lidardesign.density.objective.prepare import prepare_target, training_scenes
 from lidardesign.density.objective.proposals import independent_samples, log_proposal
@@ -295,7 +295,7 @@ def draft_note(measured: Sequence[tuple[int, Estimate]], preset: str) -> str | N
 
 
 def _notes(trainer: Trainer, place: torch.device, preset: str) -> list[str]:
-    notes = [] if stays_on(trainer.target, place) else [ON_PROCESSOR]
+    notes = [] if place.type == "cpu" or isinstance(trainer.target, DeviceTarget) else [ON_PROCESSOR]
     if trainer.skipped:
         notes.append(f"{trainer.skipped} steps were skipped: their loss or gradient was not finite")
     if trainer.doubled_at is not None:
