@@ -23,7 +23,7 @@ from lidardesign.errors import InfeasibleError
 from lidardesign.parts.catalogue import Pose, find_part, part_design
 from lidardesign.report.tables import sensors_table
 from lidardesign.run.yaml import load_yaml
-from lidardesign.sensors.compare import paired_sensors
+from lidardesign.sensors.compare import difference, paired_sensors
 from lidardesign.sensors.design_file import save_design
 
 PART = "vl53l8cx:4x4"
@@ -173,7 +173,7 @@ def test_wherever_a_sensor_looks_its_roll_part_and_frame_are_said(lidardesign, t
         assert (found["frame"], found["sensors"][0]["part"]) == (mount or "world", PART)
         assert found["sensors"][0]["boresight"]["roll_rad"] == pytest.approx(np.pi / 2)
     upright = replace(design, sensors=(replace(design.sensors[0], roll_rad=0.0),))
-    assert paired_sensors(upright, design)[0].as_dict()["difference"]["roll_deg"] == pytest.approx(90)
+    assert difference(*paired_sensors(upright, design)[0])["difference"]["roll_deg"] == pytest.approx(90)
 
 
 def test_every_pinned_place_gets_a_sensor(lidardesign, flat):

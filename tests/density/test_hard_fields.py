@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 
 from lidardesign.config import DensitySettings
 from lidardesign.density.fields import grids
-from lidardesign.density.fields.bodies import collect_bodies
 from lidardesign.density.fields.distance import TableField, build_field
 from lidardesign.density.objective.surfaces import SceneTable, near_pairs
 from lidardesign.density.objective.target import Target, build_target
@@ -58,7 +57,7 @@ def asked_of(name):
         field = field_of(moving)
         return lambda p: field.distances(p)[:, 1]
     if name == "frames":
-        bodies = collect_bodies([moving], lambda body: True, resolution=32, padding_m=0.1)
+        bodies = build_field([moving], lambda body: True, resolution=32, padding_m=0.1).bodies
         return lambda p: near_pairs(bodies, p, np.zeros(2), 1.0, 1e9).distances[::2]
     return lambda p: exact_distances([ball], p)[:, 0]
 

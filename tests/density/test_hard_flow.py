@@ -18,6 +18,7 @@ from support.learning import SPACE, BallTask, Interrupter, a_trainer, config_of,
 
 from lidardesign.config import DensitySettings
 from lidardesign.density.network import BoundedSpline
+from lidardesign.density.objective.proposals import independent_samples
 from lidardesign.density.objective.target import Target
 from lidardesign.density.training import quality as measure
 from lidardesign.density.training import trainer as training
@@ -262,7 +263,7 @@ class TestModesFarApart:
         judged = SimpleNamespace(
             flow=one.flow.double(), target=both.target, coordinates=one.coordinates, generator=one.generator
         )
-        probes = measure.draw_probes(both.target, 2000, np.random.default_rng(1))
+        probes = independent_samples(both.target, 2000, np.random.default_rng(1))
         found = measure.measure(judged, probes, 4000).estimates
         assert found["coverage"].value == pytest.approx(0.5, abs=0.1)
         assert found["misplaced"].value > 0.4

@@ -9,8 +9,8 @@ from support.sensors import normal_sensor
 from lidardesign.errors import DataError
 from lidardesign.formats.designs import load_design
 from lidardesign.formats.galvo import SPEED_OF_LIGHT_M_PER_PS, read_galvo
-from lidardesign.formats.mounts import angles_between
 from lidardesign.formats.registry import EXPORTERS
+from lidardesign.sensors.compare import angles_between
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.sensor import interval_factor
 

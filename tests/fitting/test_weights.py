@@ -78,7 +78,7 @@ def test_constrain_keeps_how_a_design_was_weighted(lidardesign, flat, weighted):
     found = succeeded(lidardesign, "constrain", weighted, "--set", "gate.width_m.max=0.6")
     assert found["satisfied"]
     one, other = (Weighting.of(load_design(flat / "designs" / f"{name}.yaml")) for name in ("w", "constrained"))
-    assert other.as_document() == one.as_document()
+    assert other.settings == one.settings != ()
 
 
 OTHER_VERSIONS = {

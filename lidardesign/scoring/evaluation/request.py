@@ -22,7 +22,7 @@ from lidardesign.scenes.scene import Scene
 from lidardesign.scoring.baselines.cma import CmaSettings
 from lidardesign.scoring.baselines.simple import ALWAYS, BASELINES, check_baseline
 from lidardesign.scoring.evaluation.mounting import MountError
-from lidardesign.sensors.adaptive import AdaptivePatterns, AdaptiveRays
+from lidardesign.sensors.adaptive import AdaptivePatterns, AdaptiveRays, mapped
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.simulate.calibration import with_part_light
@@ -135,7 +135,7 @@ class EvaluationRequest:
     def following(self, design: DesignSpec, adaptive: AdaptivePatterns) -> AdaptiveRays:
         """The rays of a design's patterns that follow what they see, with the detector's light."""
         rays = adaptive.rays(features_of(self.task))
-        return rays.mapped(lambda one: with_part_light(one, design, self.planner.detector))
+        return mapped(rays, lambda one: with_part_light(one, design, self.planner.detector))
 
 
 def numbers_fired(design: DesignSpec, asked: Iterable[int], alone: Sequence[int] = ()) -> list[int]:
