@@ -36,7 +36,7 @@ def designs_of(request: Any, training: Any, others: int) -> dict[str, Any]:
     from lidardesign.fitting.part_shapes import PartBundle, part_table, parts_inform
     from lidardesign.parts.catalogue import named_parts
     from lidardesign.rays.information import checked_information
-    from lidardesign.rays.training import CHOICE
+    from lidardesign.rays.training_scenes import CHOICE
     from lidardesign.samples import load_samples
 
     rules, run, count = request.constraints, request.run, request.sensors
@@ -90,7 +90,7 @@ def compared(options: Any, klux: float) -> dict[str, Any]:
     from lidardesign.config import with_task_settings
     from lidardesign.fitting.options import FitOptions
     from lidardesign.fitting.request import FitRequest
-    from lidardesign.rays.training import TrainingScenes
+    from lidardesign.rays.training_scenes import TrainingScenes
 
     run, settings = open_run(options.run), [f"illuminance_lux={1000 * klux:g}", "light=sun"]
     asked: dict[str, Any] = {"parts": options.parts.split(","), "sensors": options.count, "detector": options.detector}

@@ -34,7 +34,7 @@ def chosen(options: Any, kinds: int) -> dict[str, Any]:
     from lidardesign.fitting.part_shapes import PartBundle, part_table, parts_inform
     from lidardesign.parts.catalogue import named_parts
     from lidardesign.rays.information import checked_information
-    from lidardesign.rays.training import CHOICE, TrainingScenes
+    from lidardesign.rays.training_scenes import CHOICE, TrainingScenes
     from lidardesign.run_folder import RunFolder
     from lidardesign.samples import load_samples
 

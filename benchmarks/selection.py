@@ -58,7 +58,7 @@ def chosen(options: Any, candidates: int, scenes: int) -> tuple[Any, Any, Any, n
     from lidardesign.rays.choice import RayCounts, choose
     from lidardesign.rays.coverage import gather
     from lidardesign.rays.gates import gate_choices
-    from lidardesign.rays.training import inform
+    from lidardesign.rays.training_scenes import inform
     from lidardesign.sensors.bandwidth import Bandwidth
 
     task, rays = FaceTask(), even_candidates(face_scenes(options.model, 5), candidates)
@@ -130,7 +130,7 @@ def proxy_beside_score(options: Any) -> tuple[list[list[object]], float]:
 
     from lidardesign.rays.choice import RayCounts, choose
     from lidardesign.rays.coverage import gather
-    from lidardesign.rays.training import inform
+    from lidardesign.rays.training_scenes import inform
     from lidardesign.simulate.returns import simulate
 
     task, generator = FaceTask(), np.random.default_rng(0)

@@ -43,7 +43,7 @@ def pytest_collection_modifyitems(items):
 
 # Numbers of scenes, and numbers of sensors that are tried, with the modules that read them.
 SMALL = {
-    "FEW_SCENES": (5, "rays.information rays.training rays.selection fitting.chosen fitting.trials"),
+    "FEW_SCENES": (5, "rays.information rays.training_scenes rays.selection fitting.chosen fitting.trials"),
     "MOST_SCENES": (10, "rays.information rays.selection fitting.trials"),
     "USUAL_SCENES": (10, "scoring.evaluation.entries"),
     "COUNTS": ((1, 2), "fitting.fit"),

@@ -16,18 +16,18 @@ from lidardesign.config import with_task_settings
 from lidardesign.errors import MAX_SEED, ConfigError, check_number, names_arguments
 from lidardesign.fitting.fit import twin_samples, twin_without_visibility
 from lidardesign.numerics import SLACK
-from lidardesign.rays.training import TrainingScenes
+from lidardesign.rays.training_scenes import TrainingScenes
 from lidardesign.run.clock import Progress, outermost_clock, phase, running
 from lidardesign.run_folder import DESIGN_FOLDER, Notes, RunFolder, log_note, settings_texts
 from lidardesign.samples import load_samples
 from lidardesign.scoring.baselines.cma import CMA, DEFAULT_SECONDS, CmaSettings
 from lidardesign.scoring.baselines.simple import ALWAYS, BASELINES, NONE, check_baseline
+from lidardesign.scoring.evaluation.headline import check_audit, check_better, check_limit
 from lidardesign.scoring.evaluation.last_scores import SCORES, last_scores_of
 from lidardesign.scoring.evaluation.mounting import MountError
 from lidardesign.scoring.evaluation.request import EvaluationRequest, numbers_alone, usual_numbers
 from lidardesign.scoring.evaluation.results import Evaluation, Paired, Row, write_csv
 from lidardesign.scoring.evaluation.score import evaluate as score_designs
-from lidardesign.scoring.evaluation.thresholds import check_audit, check_better, check_limit
 from lidardesign.sensors.sensor import MOST_RAYS
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.plan import Planner, Tolerance, parse_effects

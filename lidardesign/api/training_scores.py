@@ -51,7 +51,7 @@ class TrainingScores:
     @cached_property
     def scenes(self) -> list[Scene]:
         """The scenes."""
-        from lidardesign.rays.training import TrainingScenes
+        from lidardesign.rays.training_scenes import TrainingScenes
 
         run = self.run.with_settings(self.settings)
         stream = TrainingScenes(run, run.config.seed).scenes(PURPOSE)

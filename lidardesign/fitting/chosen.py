@@ -34,7 +34,7 @@ from lidardesign.rays.proposals import (
     rays_of_points,
 )
 from lidardesign.rays.selection import Selected, Selection, inform_enough, select
-from lidardesign.rays.training import CHOICE, HELD_BACK, InformedScene, TrainingScenes
+from lidardesign.rays.training_scenes import CHOICE, HELD_BACK, InformedScene, TrainingScenes
 from lidardesign.run.clock import phase
 from lidardesign.samples import Samples
 from lidardesign.scenes.rays import Rays

@@ -43,8 +43,7 @@ from lidardesign.parts.part import Part
 from lidardesign.rays import information
 from lidardesign.rays.certificate import certificate_document
 from lidardesign.rays.coverage import Coverage
-from lidardesign.rays.selection import are_enough
-from lidardesign.rays.training import CHOICE, HELD_BACK, InformedScene, TrainingScenes
+from lidardesign.rays.training_scenes import CHOICE, HELD_BACK, InformedScene, TrainingScenes, are_enough
 from lidardesign.run.clock import phase
 from lidardesign.samples import Samples
 from lidardesign.scenes.rays import Rays

@@ -33,7 +33,7 @@ from lidardesign.parts.part import Part, to_angles, to_directions
 from lidardesign.rays import kernels
 from lidardesign.rays.coverage import Coverage, gather
 from lidardesign.rays.information import choosing
-from lidardesign.rays.training import InformedScene
+from lidardesign.rays.training_scenes import InformedScene
 from lidardesign.run.clock import phase
 from lidardesign.scenes.rays import Rays, Returns
 from lidardesign.scenes.scene import Scene

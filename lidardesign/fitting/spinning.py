@@ -28,7 +28,7 @@ from lidardesign.rays.certificate import certificate_document, certify
 from lidardesign.rays.choice import Choice, RayCounts, choose
 from lidardesign.rays.coverage import Coverage, gather
 from lidardesign.rays.proposals import CANDIDATES_PER_RAY
-from lidardesign.rays.training import inform
+from lidardesign.rays.training_scenes import inform
 from lidardesign.run.clock import phase
 from lidardesign.samples import Samples
 from lidardesign.scenes.rays import Rays, Returns

@@ -20,7 +20,7 @@ from lidardesign.estimates import Interval, mean_interval
 from lidardesign.fitting.request import FitRequest
 from lidardesign.rays.information import FEW_SCENES, MOST_SCENES
 from lidardesign.rays.selection import SHARE_PER_BANDWIDTH
-from lidardesign.rays.training import HELD_BACK, TrainingScenes
+from lidardesign.rays.training_scenes import HELD_BACK, TrainingScenes
 from lidardesign.run.yaml import merged
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Scene, group_numbers

@@ -24,7 +24,7 @@ from lidardesign.rays.choice import Choice, choose, choose_within
 from lidardesign.rays.coverage import Coverage
 from lidardesign.rays.information import checked_information, choosing
 from lidardesign.rays.selection import Selection
-from lidardesign.rays.training import CHOICE, InformedScene, TrainingScenes
+from lidardesign.rays.training_scenes import CHOICE, InformedScene, TrainingScenes
 from lidardesign.run.clock import phase
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Scene

@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from lidardesign.rays import kernels
-from lidardesign.rays.training import LARGEST, InformedScene
+from lidardesign.rays.training_scenes import LARGEST, InformedScene
 
 # Where a sensor may fail: how much the mean over losses counts, and of how many sensors an item's loss is asked.
 # The mean over losses alone lets two sensors see the same: faces are 11 % worse while both live, and lose no less.

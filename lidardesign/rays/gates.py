@@ -14,7 +14,7 @@ import numpy as np
 from lidardesign.constraints.document import SensorRules
 from lidardesign.mixture.bounds import Bounds, bounds_of
 from lidardesign.mixture.m_step import fit_gate
-from lidardesign.rays.training import InformedScene
+from lidardesign.rays.training_scenes import InformedScene
 from lidardesign.run.clock import phase
 from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.sensor import Sensor, interval_factor

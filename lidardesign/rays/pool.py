@@ -28,7 +28,7 @@ from lidardesign.rays.gates import gate_choices
 from lidardesign.rays.information import CHOSEN_SHARE, MOST_SELECTED
 from lidardesign.rays.proposals import CANDIDATES_PER_RAY, draw_order, nearest_samples
 from lidardesign.rays.selection import Selection, inform_enough
-from lidardesign.rays.training import InformedScene, TrainingScenes
+from lidardesign.rays.training_scenes import InformedScene, TrainingScenes
 from lidardesign.registry import distribution_of
 from lidardesign.run.arrays import read_npz
 from lidardesign.run.clock import phase

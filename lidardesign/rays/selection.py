@@ -18,16 +18,13 @@ from lidardesign.rays.certificate import certificate_document, certify, price_cu
 from lidardesign.rays.choice import MOST_PASSES, Choice, RayCounts, choose, choose_within
 from lidardesign.rays.coverage import Coverage, gather
 from lidardesign.rays.information import CHOSEN_SHARE, FEW_SCENES, MOST_ENTRIES, MOST_SCENES
-from lidardesign.rays.training import CHOICE, HELD_BACK, InformedScene, TrainingScenes
+from lidardesign.rays.training_scenes import CHOICE, HELD_BACK, InformedScene, TrainingScenes, are_enough
 from lidardesign.run.clock import phase
 from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.bandwidth import Bandwidth, split_budget
 
 # Where bandwidth has no limit, ten percent more of it must bring two percent less loss or more worth.
 SHARE_PER_BANDWIDTH = 0.2
-# Scenes are enough once doubling them lowered the loss on scenes held back by less than the first share, and the loss
-# on its own scenes is lower by at most the second; doubling again would gain about a hundredth.
-SMALLEST_GAIN, SMALLEST_GAP = 0.02, 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -319,14 +316,3 @@ def inform_enough(
         if is_large or are_enough(before, loss, coverage.loss_of(gate)):
             return informed, held_back
         wanted *= 2
-
-
-def are_enough(before: float, loss: float, own: float) -> bool:
-    """True where doubling the scenes of a choice would hardly lower its loss on others.
-
-    Arguments:
-        before: Loss of the choice on half the scenes, on scenes held back.
-        loss: Loss of this choice there.
-        own: Its loss on the scenes that it was chosen on.
-    """
-    return loss >= (1 - SMALLEST_GAIN) * before and loss - own <= SMALLEST_GAP * loss

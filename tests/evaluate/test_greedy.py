@@ -12,7 +12,7 @@ from support.baselines import SceneBaselines, balls
 from support.scoring import MissTask, design, make_request, rows_by_key
 
 from lidardesign.rays import information
-from lidardesign.rays.training import TrainingScenes
+from lidardesign.rays.training_scenes import TrainingScenes
 from lidardesign.scoring.baselines import greedy as greedy_module
 from lidardesign.scoring.baselines.candidates import whole_range
 from lidardesign.scoring.baselines.greedy import Fired, GreedyCandidate, greedy_rays
@@ -153,7 +153,7 @@ def test_one_gate_for_all_is_that_of_the_crops_and_costs_what_it_costs():
 def test_rays_of_a_place_are_those_that_are_chosen_there_alone(monkeypatch):
     # how far a return tells follows from all returns, and which items are drawn from all items
     monkeypatch.setattr(information, "return_reach_m", lambda *arguments: 0.1)
-    monkeypatch.setattr("lidardesign.rays.training.MOST_ITEMS", 3 * len(EVEN_ON_A_BALL))
+    monkeypatch.setattr("lidardesign.rays.training_scenes.MOST_ITEMS", 3 * len(EVEN_ON_A_BALL))
     together = candidate(ASIDE, gates_per_ray=False, spaces=PLACES).positions(PLACES, COUNTS[-1])
     for place, rays in zip(PLACES, together, strict=True):
         alone = candidate(ASIDE, gates_per_ray=False, spaces=[place]).positions([place], COUNTS[-1])

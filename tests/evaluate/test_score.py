@@ -15,9 +15,9 @@ from lidardesign.report.figures import scores_figure
 from lidardesign.report.tables import paired_tables
 from lidardesign.scoring.baselines import candidates
 from lidardesign.scoring.evaluation.entries import FEWEST_BASELINE_SCENES
+from lidardesign.scoring.evaluation.headline import worse_than_threshold
 from lidardesign.scoring.evaluation.results import csv_text, verdict
 from lidardesign.scoring.evaluation.score import evaluate
-from lidardesign.scoring.evaluation.thresholds import worse_than_threshold
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.space import DesignSpace
 from lidardesign.task import Score

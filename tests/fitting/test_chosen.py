@@ -17,7 +17,7 @@ from lidardesign.constraints.document import Constraints
 from lidardesign.density.objective.proposals import samples_without_visibility
 from lidardesign.errors import ConfigError
 from lidardesign.formats.designs import load_design, read_design
-from lidardesign.rays import training
+from lidardesign.rays import training_scenes
 from lidardesign.run.yaml import dump_yaml
 from lidardesign.run_folder import RunFolder
 from lidardesign.samples import save_samples
@@ -126,7 +126,7 @@ class TestTheCommand:
 
     def test_refuses_rays_that_tell_nothing(self, lidardesign, run, monkeypatch):
         nothing = Information(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(5, int))
-        monkeypatch.setattr(training, "checked_information", lambda task, scene, returns: nothing)
+        monkeypatch.setattr(training_scenes, "checked_information", lambda task, scene, returns: nothing)
         refused = lidardesign("fit", run, "--rays", 4)
         assert refused.code == 3
         assert "tells anything about 5 training scenes" in refused.err

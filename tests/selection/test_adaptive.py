@@ -19,7 +19,7 @@ from lidardesign.rays.adaptive import Frames, PatternSearch
 from lidardesign.rays.choice import RayCounts, choose, choose_within
 from lidardesign.rays.information import features_of
 from lidardesign.rays.selection import Selection
-from lidardesign.rays.training import InformedScene
+from lidardesign.rays.training_scenes import InformedScene
 from lidardesign.scenes.rays import Outcome, Returns
 from lidardesign.sensors.adaptive import AdaptiveRays, PatternRule, mapped, mean_mbps, returns_of
 from lidardesign.sensors.bandwidth import Bandwidth

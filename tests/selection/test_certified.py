@@ -12,7 +12,8 @@ from support.coverages import small
 from support.rays import random_fan, rays_along
 
 from lidardesign.rays.choice import RayCounts, choose
-from lidardesign.rays.selection import Selection, are_enough
+from lidardesign.rays.selection import Selection
+from lidardesign.rays.training_scenes import are_enough
 from lidardesign.sensors.bandwidth import Bandwidth
 
 SELECTION = Selection(rays_along(random_fan(7, 1.0)), [slice(0, 7)], gates=None, bandwidth=Bandwidth())

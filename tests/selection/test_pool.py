@@ -17,7 +17,7 @@ from lidardesign.api.run import open_run
 from lidardesign.config import resolve
 from lidardesign.rays import pool
 from lidardesign.rays.pool import FILE_NAME, pool_of
-from lidardesign.rays.training import InformedScene, TrainingScenes
+from lidardesign.rays.training_scenes import InformedScene, TrainingScenes
 from lidardesign.run_folder import RunFolder
 from lidardesign.samples import load_samples, save_samples
 from lidardesign.sensors.design_file import design_document

@@ -126,7 +126,7 @@ class TestDesigns:
         ("options", "says"),
         [
             (("--layout", "spinning", "--channels", 4, "--rays", 30), "30 rays of 1 sensors with 4 channels"),
-            (("--layout", "spinning", "--sensors", "best"), "'best' sensors that spin"),
+            (("--layout", "spinning", "--sensors", "best"), "'best' sensors in the layout spinning"),
             (("--layout", "even", "--channels", 4), "4 channels in the layout even"),
             (("--layout", "spinning", "--gates", "ray"), "a gate per ray in the layout spinning"),
             (("--layout", "spinning", "--channels", 100_000), "1 to 1000"),

@@ -35,7 +35,7 @@ from lidardesign.task import Task
 if TYPE_CHECKING:
     from lidardesign.rays.coverage import Coverage
     from lidardesign.rays.selection import Selection
-    from lidardesign.rays.training import InformedScene, TrainingScenes
+    from lidardesign.rays.training_scenes import InformedScene, TrainingScenes
 
 GREEDY = "greedy"
 USUAL_SCENES = 200  # that rays are chosen on where no design has a number of its own
@@ -177,7 +177,7 @@ class GreedyCandidate:
     @cached_property
     def _table(self) -> _Table:
         from lidardesign.rays.selection import Selection
-        from lidardesign.rays.training import CHOICE
+        from lidardesign.rays.training_scenes import CHOICE
 
         ends = np.cumsum([0, *map(len, self._proposed)]).tolist()
         visits = [slice(*pair) for pair in itertools.pairwise(ends)]

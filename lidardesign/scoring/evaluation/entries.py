@@ -16,7 +16,7 @@ import numpy as np
 
 from lidardesign.errors import ConfigError
 from lidardesign.rays.proposals import CANDIDATES_PER_RAY
-from lidardesign.rays.training import HELD_BACK
+from lidardesign.rays.training_scenes import HELD_BACK
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.scoring.baselines import cma

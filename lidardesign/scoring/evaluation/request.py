@@ -14,7 +14,7 @@ from typing import Any
 
 from lidardesign.errors import ConfigError, PluginError
 from lidardesign.rays.information import features_of
-from lidardesign.rays.training import TrainingScenes
+from lidardesign.rays.training_scenes import TrainingScenes
 from lidardesign.registry import plugin_guard
 from lidardesign.samples import Samples
 from lidardesign.scenes.rays import Rays

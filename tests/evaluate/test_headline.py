@@ -12,9 +12,9 @@ from support.scoring import HitTask, design, make_request
 from lidardesign.errors import ThresholdError
 from lidardesign.estimates import paired_difference
 from lidardesign.scoring.evaluation.entries import StrongestBaseline
+from lidardesign.scoring.evaluation.headline import check_better, check_limit, difference_text, headline_texts
 from lidardesign.scoring.evaluation.results import Evaluation, Paired, verdict
 from lidardesign.scoring.evaluation.score import evaluate
-from lidardesign.scoring.evaluation.thresholds import check_better, check_limit, difference_text, headline_texts
 
 
 @pytest.mark.parametrize(

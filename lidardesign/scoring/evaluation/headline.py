@@ -1,4 +1,4 @@
-"""Thresholds of designs: no worse than a limit, better than a baseline, and moved by no effect that was skipped.
+"""The headline of an evaluation, and the thresholds of designs: no worse than a limit, better than a baseline, unmoved.
 
 Each check raises a `ThresholdError`, with which commands exit 1.
 """
