@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
 import math
-import os
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -12,7 +11,7 @@ import pytest
 from support.command_line import make_run
 
 from lidardesign.constraints.document import Constraints
-from lidardesign.errors import DataError, LidardesignError
+from lidardesign.errors import DataError
 from lidardesign.formats.designs import load_design
 from lidardesign.formats.registry import EXPORTERS
 from lidardesign.formats.rig import aim_of, rig_constraints
@@ -68,13 +67,10 @@ def test_an_exported_rig_comes_back_ray_by_ray(tmp_path, name):
     path = tmp_path / f"rig{EXPORTERS[name].suffix}"
     EXPORTERS[name].write(design, rays, path)
     found = load_design(path)
-    # the exchange format of MuJoCo lists sensors in the order in which they first fire
-    order = {one: index for index, one in enumerate(dict.fromkeys(rays.sensor.tolist()))}
-    again = found.rays()
-    expected = rays
-    if name == "mjcf":
-        kept = np.array([order[index] for index in rays.sensor.tolist()])
-        expected = type(rays)(rays.origin_m, rays.direction, rays.gate_m, kept, rays.time_s)
+    again, expected = found.rays(), rays
+    if name == "mjcf":  # lists sensors in the order in which they first fire
+        order = {one: index for index, one in enumerate(dict.fromkeys(rays.sensor.tolist()))}
+        expected = replace(rays, sensor=np.array([order[index] for index in rays.sensor.tolist()]))
     assert_same_rays(again, expected)
     assert found.provenance["notes"] == []
     if name == "npz":
@@ -261,7 +257,7 @@ def random_model(seed):
     return root
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_rangefinders_look_from_where_mujoco_says_they_are(tmp_path, seed):
     import mujoco
 
@@ -330,7 +326,7 @@ BAD_XML = {
         model_of("", '<replicate count="999"><replicate count="99"><site/></replicate></replicate>'),
         "replicates too much",
     ),
-    "too many sites": (model_of("", "<site/>" * 120_001), "too many bodies, sites and sensors"),
+    "too many sites": (model_of("", "<site/>" * 21), "too many bodies, sites and sensors"),
     "no number of copies": (model_of("", '<replicate count="many"><site/></replicate>'), "count is 'many'"),
     "another model": (model_of("", '<attach model="x"/>'), "attaches another model"),
     "no end": (model_of('<rangefinder site="a"/>'), "does not say how far 1 of its 1 rays reach"),
@@ -343,7 +339,8 @@ BAD_XML = {
 
 
 @pytest.mark.parametrize("case", BAD_XML)
-def test_xml_that_cannot_be_used_is_refused_by_what_is_wrong(tmp_path, case):
+def test_xml_that_cannot_be_used_is_refused_by_what_is_wrong(tmp_path, monkeypatch, case):
+    monkeypatch.setattr("lidardesign.formats.mjcf.MOST_KEPT", 20)
     content, message = BAD_XML[case]
     path = tmp_path / "m.xml"
     path.write_text(content)
@@ -512,13 +509,10 @@ def test_more_lidars_than_a_design_has_are_refused_at_the_first_too_many(tmp_pat
 
 
 def test_what_an_sdf_file_says_beyond_a_design_is_told(tmp_path):
-    extra = lidar(columns=(1, -0.5, 0.5), rows=None, reach="<max>inf</max>").replace(
-        "<range>", "<noise><type>gaussian</type></noise><range>"
-    )
-    two = lidar(name="eye", rows=(2, 0, 0.1)).replace(
-        "<samples>5", "<samples>5</samples><resolution>2</resolution><!--"
-    )
-    two = two.replace("<!--</samples>", "")
+    noise = "<noise><type>gaussian</type></noise><range>"
+    extra = lidar(columns=(1, -0.5, 0.5), rows=None, reach="<max>inf</max>").replace("<range>", noise)
+    finer = "<samples>5</samples><resolution>2</resolution>"
+    two = lidar(name="eye", rows=(2, 0, 0.1)).replace("<samples>5</samples>", finer)
     text = f'<model name="m"><link name="a">{extra}</link><link name="b">{two}</link></model>'
     design = load_sdf(tmp_path, text, reach_m=3.0)
     notes = "\n".join(design.provenance["notes"])
@@ -530,43 +524,36 @@ def test_what_an_sdf_file_says_beyond_a_design_is_told(tmp_path):
 
 
 CHAIN = "".join(f'<frame name="f{one}" attached_to="f{one + 1}"/>' for one in range(400)) + '<frame name="f400"/>'
+
+
+def posed(pose, more=""):
+    """A model with a lidar that stands by a pose."""
+    return f'<model name="m"><link name="a">{pose}{lidar()}</link>{more}</model>'
+
+
+def beside(frame):
+    return f'<pose relative_to="{frame}">0 0 0 0 0 0</pose>'
+
+
+NAMELESS = f'<world name="w"><model><pose>5 0 0 0 0 0</pose><link name="a">{lidar()}</link></model></world>'
 BAD_SDF = {
-    "a circle": (
-        '<model name="m"><link name="a"><pose relative_to="b">0 0 0 0 0 0</pose>{lidar}</link>'
-        '<frame name="b" attached_to="a"/></model>',
-        "is relative to itself",
-    ),
-    "an unknown frame": (
-        '<model name="m"><link name="a"><pose relative_to="z">0 0 0 0 0 0</pose>{lidar}</link></model>', "'z'",
-    ),
-    "five numbers": ('<model name="m"><link name="a"><pose>0 0 0 0 0</pose>{lidar}</link></model>', "6 finite numbers"),
-    "no quaternion": (
-        '<model name="m"><link name="a"><pose rotation_format="quat_xyzw">0 0 0 0 0 0 0</pose>{lidar}</link></model>',
-        "no length",
-    ),
-    "a link without a name": ('<model name="m"><link>{lidar}</link></model>', "no name"),
-    "a model without a name": (
-        '<world name="w"><model><pose>5 0 0 0 0 0</pose><link name="a">{lidar}</link></model></world>', "no name",
-    ),
-    "two links of one name": (
-        '<model name="m"><link name="a">{lidar}</link><link name="a"><pose>1 0 0 0 0 0</pose>{lidar}</link></model>',
-        "a second link is called 'a'",
-    ),
-    "the world inside a model": (
-        '<model name="m"><link name="a"><pose relative_to="world">0 0 0 0 0 0</pose>{lidar}</link></model>', "'world'",
-    ),
-    "a chain of frames": (
-        f'<model name="m">{CHAIN}<link name="a"><pose relative_to="f0">0 0 0 0 0 0</pose>{{lidar}}</link></model>',
-        "is relative to too many others",
-    ),
-}  # fmt: skip
+    "a circle": (posed(beside("b"), '<frame name="b" attached_to="a"/>'), "is relative to itself"),
+    "an unknown frame": (posed(beside("z")), "'z'"),
+    "five numbers": (posed("<pose>0 0 0 0 0</pose>"), "6 finite numbers"),
+    "no quaternion": (posed('<pose rotation_format="quat_xyzw">0 0 0 0 0 0 0</pose>'), "no length"),
+    "a link without a name": (f'<model name="m"><link>{lidar()}</link></model>', "no name"),
+    "a model without a name": (NAMELESS, "no name"),
+    "two links of one name": (posed("", f'<link name="a">{lidar()}</link>'), "a second link is called 'a'"),
+    "the world inside a model": (posed(beside("world")), "'world'"),
+    "a chain of frames": (posed(beside("f0"), CHAIN), "is relative to too many others"),
+}
 
 
 @pytest.mark.parametrize("case", BAD_SDF)
 def test_poses_that_cannot_be_found_are_refused_with_their_line(tmp_path, case):
     text, message = BAD_SDF[case]
     with pytest.raises(DataError) as refused:
-        load_sdf(tmp_path, text.replace("{lidar}", lidar()))
+        load_sdf(tmp_path, text)
     assert message in str(refused.value)
     assert refused.value.where == f"{tmp_path / 'robot.sdf'}:3"
 
@@ -583,47 +570,6 @@ def test_poses_that_cannot_be_found_are_refused_with_their_line(tmp_path, case):
 def test_a_scan_that_cannot_be_is_refused(tmp_path, options):
     with pytest.raises(DataError, match=r"robot\.sdf"):
         load_sdf(tmp_path, f'<model name="m"><link name="l">{lidar(**options)}</link></model>')
-
-
-# ------------------------------------------------------------------- garbage
-
-
-@pytest.fixture(scope="module")
-def originals(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("originals")
-    design = rig()
-    for name in ("csv", "npz", "mjcf", "sdf"):
-        EXPORTERS[name].write(design, design.rays(), folder / f"rig{EXPORTERS[name].suffix}")
-    return sorted(folder.iterdir())
-
-
-def test_damaged_files_are_read_or_refused_and_nothing_else(tmp_path, originals):
-    generator = np.random.default_rng(11)
-    outcomes = []
-    for number in range(240):
-        source = originals[number % len(originals)]
-        content = bytearray(source.read_bytes())
-        for _ in range(int(generator.integers(1, 4))):
-            place = int(generator.integers(len(content)))
-            choice = generator.integers(3)
-            if choice == 0:
-                content[place] = int(generator.integers(256))
-            elif choice == 1:
-                del content[place : place + int(generator.integers(1, 40))]
-            else:
-                content[place:place] = content[int(generator.integers(len(content))) :][:30]
-        path = tmp_path / source.name
-        path.write_bytes(bytes(content))
-        try:
-            rays = load_design(path, reach_m=2.0).rays()
-        except LidardesignError as error:
-            outcomes.append(error.exit_code)
-        else:
-            assert np.isfinite(rays.direction).all()
-            outcomes.append(0)
-    assert set(outcomes) <= {0, 2, 3}
-    assert outcomes.count(0) > 5
-    assert outcomes.count(3) > 50
 
 
 # ------------------------------------------------------------------- commands
@@ -653,7 +599,7 @@ def test_a_rig_scores_as_the_design_that_fires_its_rays(call, run, tmp_path):
     path = flat_rig(tmp_path, end=False)
     save_design(load_design(path, reach_m=1.2), tmp_path / "same.yaml")
     for asked, count in (((), 16), (("--rays", 8), 8)):
-        result = call("evaluate", path, "same.yaml", "--in", run, *asked, "--json")
+        result = call("evaluate", path, "same.yaml", "--in", run, *asked, "--baseline", "none", "--json")
         assert result.code == 0, result.err
         values = {row["design"]: row["value"] for row in result.json["rows"]}
         assert values["fans"] == values["same"]
@@ -662,34 +608,12 @@ def test_a_rig_scores_as_the_design_that_fires_its_rays(call, run, tmp_path):
         assert any("subset" in note for note in result.json["notes"]) == bool(asked)
 
 
-def test_what_is_no_file_is_refused_before_it_is_waited_for(tmp_path):
-    os.mkfifo(tmp_path / "pipe")
-    for path in (type(tmp_path)("/dev/zero"), tmp_path / "pipe"):
-        with pytest.raises(DataError, match="not a regular file"):
-            load_design(path)
-
-
 @pytest.mark.parametrize("name", ["sensors-csv", "stl"])
 def test_formats_of_sensors_take_no_number_of_rays(call, tmp_path, name):
     result = call("export", flat_rig(tmp_path), "--format", name, "--rays", 20, "--out", "sensors")
     assert result.code == 2
     assert f"{name} holds sensors, not rays" in result.err
     assert not (tmp_path / "sensors").exists()
-
-
-def test_fits_like_a_rig_are_no_more_than_it(call, run, tmp_path):
-    path = flat_rig(tmp_path)
-    like = load_design(path)
-    result = call("fit", run, "--like", path, "--name", "alike", "--json")
-    assert result.code == 0, result.err
-    assert result.json["satisfied"]
-    found = load_design(run / "designs" / "alike.yaml")
-    assert found.count == 16
-    for one, theirs in itertools.zip_longest(found.sensors, like.sensors):
-        np.testing.assert_allclose(one.origin_m, theirs.origin_m)
-        assert np.all(np.array(one.field_of_view_rad) <= np.array(theirs.field_of_view_rad) + 1e-6)
-        assert one.gate_m[1] - one.gate_m[0] <= 0.8 + 1e-9
-    assert "like fans: 2 sensors, 16 rays" in result.err
 
 
 def test_sensors_like_a_planar_scanner_stay_planar():

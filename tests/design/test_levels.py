@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.command_line import make_run
 from support.designs import SPACE, drawn_from, three_sensors
 
 from lidardesign.constraints.document import Constraints
@@ -56,26 +54,23 @@ def gates_in(path):
     return design.level, np.diff(np.asarray(gates), axis=1).mean()
 
 
-def test_fit_and_constrain_take_the_level_and_a_design_that_is_constrained_keeps_it(lidardesign, tmp_path):
-    run = make_run(tmp_path / "run")
-    found = {}
-    for command in ("fit", "constrain"):
-        for level in (0.7, 0.97):
-            options = ("--layout", "even", "--rays", 12, "--sensors", 1, "--level", level)
-            result = lidardesign(command, run, *options, "--json")
-            assert result.code == 0, result.err
-            found[command, level] = gates_in(json.loads(result.out)["design"])
-            assert found[command, level][0] == level
-        assert found[command, 0.7][1] < found[command, 0.97][1]
-    assert found["fit", 0.7] == found["constrain", 0.7]
-    kept = lidardesign("constrain", run / "designs" / "fit.yaml", "--json")
-    assert kept.code == 0, kept.err
-    assert gates_in(json.loads(kept.out)["design"])[0] == 0.97
+def test_fit_and_constrain_take_the_level_and_a_design_that_is_constrained_keeps_it(lidardesign, flat):
+    found = []
+    for command, level in (("fit", 0.7), ("constrain", 0.7), ("fit", 0.97)):
+        options = ("--layout", "even", "--rays", 12, "--sensors", 1, "--level", level)
+        result = lidardesign(command, flat, *options, "--json")
+        assert result.code == 0, result.err
+        found.append(gates_in(result.json["design"]))
+        assert found[-1][0] == level
+    assert found[0] == found[1]
+    assert found[0][1] < found[2][1]
+    kept = lidardesign("constrain", flat / "designs" / "fit.yaml", "--json")
+    assert gates_in(kept.json["design"])[0] == 0.97
 
 
 @pytest.mark.parametrize("level", ["0", "1", "nan", "0.9999999"])
 @pytest.mark.parametrize("command", ["fit", "constrain"])
-def test_a_level_that_holds_nothing_or_everything_is_refused(lidardesign, tmp_path, command, level):
-    result = lidardesign(command, make_run(tmp_path / "run", count=1000), "--level", level)
+def test_a_level_that_holds_nothing_or_everything_is_refused(lidardesign, made, command, level):
+    result = lidardesign(command, made, "--level", level)
     assert result.code == 2
     assert "--level" in result.err

@@ -97,14 +97,6 @@ def test_a_point_is_inside_a_box_or_in_a_free_one(boxes, point):
     )
 
 
-def test_one_pillar_leaves_its_six_sides():
-    free = free_boxes(one_with([{"low_m": [2, 2, 2], "high_m": [3, 4, 5]}]), SPACE)
-    assert corners(free) == {
-        (0, 0, 0, 2, 6, 6), (3, 0, 0, 6, 6, 6), (0, 0, 0, 6, 2, 6), (0, 4, 0, 6, 6, 6), (0, 0, 0, 6, 6, 2),
-        (0, 0, 5, 6, 6, 6),
-    }  # fmt: skip
-
-
 def test_boxes_beside_the_space_leave_intervals_free_on_its_other_sides():
     free = free_boxes(one_with([{"low_m": [-3, -1, -1], "high_m": [0, 7, 7]}]), SPACE)
     inf = math.inf
@@ -127,14 +119,6 @@ def test_a_fixed_coordinate_is_in_a_box_or_not(height, left):
     assert len(free.low_m) == left
     assert np.isinf(free.low_m[:, 2]).all()
     assert len(free_boxes(one_with([pillar], low_m=[0, 0, 0.5], high_m=[6, 6, 0.5]), SPACE).low_m) == 4
-
-
-def test_boxes_that_touch_leave_no_gap():
-    halves = [{"low_m": [-1, -1, -1], "high_m": [3, 7, 7]}, {"low_m": [3, -1, -1], "high_m": [7, 7, 7]}]
-    assert len(free_boxes(one_with(halves), SPACE).low_m) == 0
-    halves[1]["low_m"][0] = 3.001
-    free = free_boxes(one_with(halves), SPACE)
-    assert (free.low_m[0, 0], free.high_m[0, 0]) == (3, 3.001)
 
 
 def test_the_nearest_place_is_in_the_nearest_box():

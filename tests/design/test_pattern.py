@@ -195,13 +195,6 @@ def test_moving_changes_the_named_coordinates_of_origins_alone(pattern, values):
 
 
 @given(patterns() | moving)
-def test_rays_are_counted_sensor_by_sensor(pattern):
-    counts = pattern.per_sensor(4)
-    assert counts.sum() == len(pattern)
-    assert counts.tolist() == [int((pattern.sensor == index).sum()) for index in range(4)]
-
-
-@given(patterns() | moving)
 def test_gates_are_of_rays_where_two_of_a_sensor_differ_anywhere(pattern):
     pairs = itertools.combinations(range(len(pattern)), 2)
     differ = any(

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from scipy.stats import chi2, norm
+from scipy.stats import chi2
 from support.baselines import SceneBaselines
 from support.chi_square import UNLIKELY, counts_of_cells, mass_of_cells, p_value
 from support.designs import sensor
@@ -47,25 +47,6 @@ def assert_drawn(points, edges, density, inside, whole=True):
 
 def edges_of(*sizes, low=-1.0, high=1.0):
     return [np.linspace(low, high, size + 1) for size in sizes]
-
-
-# --- the test itself
-
-
-def test_the_test_accepts_right_draws_as_often_as_it_says_and_refuses_wrong_ones():
-    generator = np.random.default_rng(0)
-    edges = edges_of(12, 12, low=-4.0, high=4.0)
-    right = mass_of_cells(lambda x: np.exp(-np.square(x).sum(axis=1) / 2) / (2 * math.pi), edges, 8)
-    values = [
-        p_value(
-            counts_of_cells(np.clip(generator.standard_normal((2000, 2)), -4, 4), edges), 2000 * right / right.sum()
-        )
-        for _ in range(200)
-    ]
-    assert abs(np.mean(np.array(values) < 0.5) - 0.5) < 4 * 0.5 / math.sqrt(200)
-    wider = np.clip(1.1 * generator.standard_normal((2000, 2)), -4, 4)
-    assert p_value(counts_of_cells(wider, edges), 2000 * right / right.sum()) < UNLIKELY
-    assert p_value([1, 99], [0.0, 100.0]) == 0.0
 
 
 # --- the flow
@@ -198,35 +179,6 @@ def test_draws_of_a_mixture_over_the_sphere_have_its_density_per_solid_angle():
     density = of_directions(lambda p: np.exp(log_density(mixture, features_of(p, POINT))))
     assert_drawn(chart, SPHERE_EDGES, density, 8)
 
-    # without the share of the tangent plane the same draws would be refused
-    def flat(points):
-        looking, total = direction(points[:, AZIMUTH], points[:, ELEVATION]), np.zeros(len(points))
-        for k in range(3):
-            tangent = tangent_coordinates(mixture.frames[k], looking)
-            total += (
-                mixture.weights[k]
-                * np.prod(norm.pdf(tangent, 0, mixture.spread_rad[k]), axis=1)
-                * norm.pdf(points[:, RANGE], mixture.range_m[k], mixture.spread_range_m[k])
-            )
-        return total
-
-    mass = mass_of_cells(of_directions(flat), SPHERE_EDGES, 4)
-    assert p_value(counts_of_cells(chart, SPHERE_EDGES), DRAWS * mass / mass.sum()) < UNLIKELY
-
-
-def test_draws_of_origins_have_the_mixtures_density_with_its_full_covariance():
-    space = DesignSpace((-9, -9, -9, 0.3, 0.1, 2.0), (9, 9, 9, 0.3, 0.1, 2.0))
-    generator = np.random.default_rng(8)
-    mixture = random_mixture(generator, 3)
-    points = drawn_from_mixture(mixture, DRAWS, generator, space)[:, :3]
-    edges = edges_of(14, 14, 14, low=-4.0, high=4.0)
-
-    def density(origins):
-        rays = np.column_stack([origins, np.tile([0.3, 0.1, 2.0], (len(origins), 1))])
-        return np.exp(log_density(mixture, features_of(rays, space)))
-
-    assert_drawn(points, edges, density, 6)
-
 
 # --- truncated sampling
 
@@ -336,15 +288,15 @@ def test_draws_from_a_pinned_origin_have_the_density_at_that_origin():
 # --- rays
 
 
-def field_mass(one, edges, density):
-    """The mass over (azimuth, sin elevation) of a density over one sensor's tangent plane, inside its field."""
+def field_mass(one, edges):
+    """The mass over (azimuth, sin elevation) of an even density over one sensor's field in its tangent plane."""
     half = np.array(one.field_of_view_rad) / 2
 
     def on_sphere(chart):
         tangent = tangent_coordinates(one.frame, direction(chart[:, 0], np.arcsin(chart[:, 1])))
         angle = np.hypot(*tangent.T)
         inside = (np.abs(tangent) <= half).all(axis=1)
-        return np.where(inside, density(tangent) / np.sinc(angle / math.pi), 0.0)
+        return np.where(inside, 1 / np.sinc(angle / math.pi), 0.0)
 
     mass = mass_of_cells(on_sphere, edges, 12)
     return mass / mass.sum()
@@ -360,15 +312,11 @@ CHART_EDGES = [np.linspace(0, 2 * math.pi, 33), np.linspace(-1, 1, 17)]
 
 def test_even_rays_are_even_over_a_wide_field_of_view_on_the_sphere():
     one = sensor(spread_rad=(0.5, 0.3), azimuth_rad=2.0)
-    mass = field_mass(one, CHART_EDGES, lambda tangent: np.ones(len(tangent)))
+    mass = field_mass(one, CHART_EDGES)
     counts = counts_of_cells(on_chart(even_rays([one], [DRAWS])), CHART_EDGES)
     # the field's edge cuts cells, which midpoints know to a part in a few hundred
     filled = DRAWS * mass > 5
     assert p_value(counts[filled], counts[filled].sum() * mass[filled] / mass[filled].sum()) > UNLIKELY
-    # a grid in azimuth and elevation instead is found out
-    wide = np.random.default_rng(13).uniform(-0.5, 0.5, (DRAWS, 2)) * one.field_of_view_rad
-    crooked = np.column_stack([wide[:, 0] + one.azimuth_rad, np.sin(wide[:, 1] + one.elevation_rad)])
-    assert p_value(counts_of_cells(crooked, CHART_EDGES), np.maximum(DRAWS * mass, 1e-3)) < UNLIKELY
 
 
 @pytest.mark.parametrize("measure", ["solid_angle", "angles"])
