@@ -6,18 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.rays import rays_along
 from support.rigs import even, farthest_nearest, sensor
 
 from lidardesign.formats.mounts import grid_losses, mounts, nearest_grid, quaternion
-from lidardesign.formats.names import (
-    distinct,
-    document,
-    element,
-    identifier,
-    renamed_note,
-    xml_text,
-)
-from lidardesign.scenes.rays import Rays, rotation_of_quaternion
+from lidardesign.formats.names import distinct, document, element, identifier, renamed_note, xml_text
+from lidardesign.scenes.rays import rotation_of_quaternion
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.pattern import grid_tangent
 from lidardesign.sensors.sensor import tangent_directions
@@ -79,10 +73,7 @@ def test_notes_count_the_rays_that_move():
     azimuth, elevation = angles(local)
     moved = np.arange(196) % 10 == 0
     azimuth = azimuth + np.where(moved, np.radians(0.2) * (-1) ** (np.arange(196) // 10), 0.0)
-    rays = Rays(
-        np.zeros((196, 3)), direction(azimuth, elevation) @ one.frame, np.tile((0.0, 1.0), (196, 1)), np.zeros(196),
-        np.zeros(196),
-    )  # fmt: skip
+    rays = rays_along(direction(azimuth, elevation) @ one.frame, (0.0, 1.0))
     mounted = mounts(DesignSpec("d", (one,)), rays)
     (note,) = grid_losses(mounted, rays)
     assert note.startswith("196 of 196 rays are not on an even grid")
@@ -96,8 +87,7 @@ def test_a_mounts_rotation_is_its_sensors_frame(seed):
     generator = np.random.default_rng(seed)
     elevation = (np.pi / 2, -np.pi / 2)[seed] if seed < 2 else generator.uniform(-1.5, 1.5)
     one = sensor("s", generator.normal(size=3), generator.uniform(0, 6.3), elevation, generator.uniform(-3, 3))
-    rays = Rays(one.origin_m[None], one.frame[:1], np.ones((1, 2)), np.zeros(1), np.zeros(1))
-    (mount,) = mounts(DesignSpec("d", (one,)), rays)
+    (mount,) = mounts(DesignSpec("d", (one,)), rays_along(one.frame[:1], (1.0, 1.0), one.origin_m))
     np.testing.assert_allclose(rotation_of_quaternion(*mount.quaternion), one.frame.T, atol=1e-15)
     roll, pitch, yaw = mount.roll_pitch_yaw_rad
     about = [quaternion(*angles_rad) for angles_rad in ((roll, 0, 0), (0, pitch, 0), (0, 0, yaw))]
