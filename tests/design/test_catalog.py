@@ -33,15 +33,13 @@ from lidardesign.parts.part import conditions_of, disagreements, to_angles, to_d
 from lidardesign.parts.statements import FIELDS, Statement
 from lidardesign.sensors.design_file import save_design
 from lidardesign.sensors.pattern import even_subset, grid_rows
-from lidardesign.sensors.sensor import boresight_frame, boresight_of
+from lidardesign.sensors.sensor import boresight_frame
 from lidardesign.space import FARTHEST_M, DesignSpace, direction
 
 LIBRARY = load_library()
 PARTS = {part.name: part for part in LIBRARY.every_mode()}
 ZONES = ("vl53l5cx", "vl53l5cx:4x4", "vl53l7cx", "vl53l8cx", "tmf8820", "tmf8820:wide", "tmf8821:3x6", "tmf8828")
 SOME = ("vl53l8cx", "tmf8820:wide", "vlp-16", "hdl-64e", "tim781", "mid-40", "mid-360", "ml30s", "azure-kinect")
-ANGLE = st.floats(-math.pi, math.pi)
-ELEVATION = st.floats(-math.pi / 2, math.pi / 2)
 OWN = """
 schema_version: 1
 maker: Us
@@ -106,12 +104,8 @@ def test_the_rays_of_a_part_are_unit_vectors_inside_its_field_and_as_many_as_it_
     assert len(np.unique(np.round(part.directions, 9), axis=0)) == part.rays
     columns, rows = part.grid
     assert columns * rows >= part.rays > (columns - 1) * (rows - 1)
-
-
-@pytest.mark.parametrize("name", [name for name, part in PARTS.items() if part.value("points_per_s")])
-def test_rays_and_frames_make_the_points_per_second_that_the_maker_states(name):
-    part = PARTS[name]
-    assert part.rays * part.rate_hz == pytest.approx(part.value("points_per_s"), rel=0.001)
+    if stated := part.value("points_per_s"):
+        assert part.rays * part.rate_hz == pytest.approx(stated, rel=0.001)
 
 
 @pytest.mark.parametrize("name", PARTS)
@@ -227,16 +221,11 @@ def test_histograms_and_processed_results_cost_what_their_bits_make():
 
 
 def test_one_source_with_several_figures_does_not_disagree_with_itself(own):
-    own.write_text(OWN.replace("  - {value: 0.1, source: bench}", "  - {value: 0.1, source: bench}\n" * 2))
-    assert disagreements(find_part(own)) == []
-    twice = "  - {value: 0.1, source: bench}\n  - {value: 0.2, source: bench}"
-    own.write_text(OWN.replace("  - {value: 0.1, source: bench}", twice))
-    assert disagreements(find_part(own)) == []
-    other = OWN.replace("  bench: {", "  list: {title: A list, kind: list}\n  bench: {")
-    own.write_text(
-        other.replace("  - {value: 0.1, source: bench}", twice.replace("0.2, source: bench", "0.2, source: list"))
-    )
-    assert disagreements(find_part(own)) == ["near_m"]
+    first, two_sources = "  - {value: 0.1, source: bench}", "  list: {title: A list, kind: list}\n  bench: {"
+    for further, source, expected in ((0.1, "bench", []), (0.2, "bench", []), (0.2, "list", ["near_m"])):
+        text = OWN.replace(first, f"{first}\n  - {{value: {further}, source: {source}}}")
+        own.write_text(text if source == "bench" else text.replace("  bench: {", two_sources))
+        assert disagreements(find_part(own)) == expected
 
 
 def test_the_range_under_conditions_is_the_farthest_that_a_source_vouches_for():
@@ -244,8 +233,6 @@ def test_the_range_under_conditions_is_the_farthest_that_a_source_vouches_for():
     assert part.under(reflectance_percent=88, illuminance_klux=0).range_m == (0.02, 3.5)
     assert part.under(reflectance_percent=50, illuminance_klux=2).range_m == (0.02, 0.8)
     assert part.under(illuminance_klux=5).range_m == (0.02, 1.1)
-    assert part.under(reflectance_percent=50, illuminance_klux=2).rays == 64
-    assert len(part.under(illuminance_klux=5).figures["far_m"]) == len(part.figures["far_m"])
 
 
 @settings(max_examples=60, deadline=None)
@@ -269,12 +256,6 @@ def test_conditions_that_no_source_states_are_refused_with_those_that_are():
 
 
 # placing
-
-
-@given(ANGLE, ELEVATION, ANGLE)
-def test_a_frame_gives_back_its_boresight(azimuth, elevation, roll):
-    frame = boresight_frame(azimuth, elevation, roll)
-    assert np.allclose(boresight_frame(*boresight_of(frame)), frame, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ZONES)
@@ -435,10 +416,8 @@ def test_names_that_lead_nowhere_are_refused(name, message):
     [
         ("kind: multi-zone", "kind: sonar", r"homemade.yaml:5:7: kind: found 'sonar'"),
         ("rows: 2", "rows: 0", r"rows"),
-        ("rows: 2", "rows: two", r"rows"),
         ("rows: 2, source: bench", "rows: 2, source: nobody", "names the source 'nobody', known are bench"),
         ("[-15, 15]", "[15, -15]", "azimuth runs from 15 down to -15"),
-        ("[-15, 15]", "[-15, 200]", "azimuth"),
         ("value: 0.1,", "value: 3,", "near_m is not below far_m"),
         ("value: 0.1,", "value: -1,", "near_m"),
         ("value: 20,", "value: 0,", "rate_hz"),
@@ -446,15 +425,10 @@ def test_names_that_lead_nowhere_are_refused(name, message):
         ("reflectance_percent: 50", "reflectance_percent: 150", "reflectance_percent"),
         ("reflectance_percent: 50", "reflectance: 50", r"homemade.yaml:16:\d+: unknown key"),
         ("far_m:", "far:", r"unknown key 'far'"),
-        ("schema_version: 1", "schema_version: 2", "schema_version"),
         ("kind: zones", "kind: spiral", "pattern"),
-        ("{kind: zones, columns: 3, rows: 2,", "{kind: rings, columns: 3,", "give either rings or elevations_deg"),
-        ("{kind: zones, columns: 3, rows: 2,", "{kind: zones, columns: 3000, rows: 3000,", "9000000 rays a frame"),
-        (
-            "{kind: zones, columns: 3, rows: 2,",
-            "{kind: rings, columns: 3, elevations_deg: [0, 11],",
-            "a beam at 11 deg",
-        ),
+        ("zones, columns: 3, rows: 2", "rings, columns: 3", "give either rings or elevations_deg"),
+        ("zones, columns: 3, rows: 2", "zones, columns: 3000, rows: 3000", "9000000 rays a frame"),
+        ("zones, columns: 3, rows: 2", "rings, columns: 3, elevations_deg: [0, 11]", "a beam at 11 deg"),
         ("elevation: [-10, 10]", "elevation: [0, 0]", "2 rays across an elevation without width"),
         ("azimuth: [-15, 15]", "azimuth: [-180, 180]", "beyond 180 degrees from the forward axis"),
         ("elevation: [-10, 10]", "elevation: [-10, 10], shape: ellipse", "its pattern has corners"),
@@ -512,8 +486,6 @@ def test_a_part_is_written_as_a_design_that_other_commands_read(call, tmp_path):
     assert beside.code == 0, beside.err
     one, other = load_design(tmp_path / "wide.yaml").sensors
     assert math.acos(one.boresight @ other.boresight) == pytest.approx(math.radians(45))
-    assert call("export", "bought.yaml", "--format", "csv", "--rays", "100").code == 0
-    assert len(Path("bought.csv").read_text().splitlines()) >= 100
 
 
 @pytest.mark.parametrize(
@@ -522,7 +494,6 @@ def test_a_part_is_written_as_a_design_that_other_commands_read(call, tmp_path):
         (("--rays", "10"), "says how a design is made"),
         (("--at-origin", "0,0,0"), "says how a design is made"),
         (("--out", "o.yaml", "--at-origin", "1,2"), "three numbers"),
-        (("--out", "o.yaml", "--at-origin", "1,2,nan"), "three numbers"),
         (("--out", "o.yaml", "--elevation-deg", "91"), "-90 to 90"),
         (("--out", "o.yaml", "--azimuth-deg", "361"), "-360 to 360"),
         (("--out", "o.yaml", "--arrange", "beside"), "is for several parts"),
@@ -530,7 +501,6 @@ def test_a_part_is_written_as_a_design_that_other_commands_read(call, tmp_path):
         (("--out", "o.yaml", "--parts", "2", "--rays", "129"), "129 rays of 2 x vl53l8cx"),
         (("--reflectance", "0"), "--reflectance"),
         (("--klux", "-1"), "--klux"),
-        (("--klux", "nan"), "--klux"),
         (("--reflectance", "5"), "no source of vl53l8cx states a range"),
     ],
 )
@@ -545,7 +515,6 @@ def test_a_part_of_more_rays_than_a_file_takes_says_what_to_do(call):
     result = call("catalog", "show", "os1-128", "--out", "o.yaml")
     assert result.code == 2
     assert "--rays N takes an evenly spread subset" in result.err
-    assert call("catalog", "show", "os1-128", "--out", "o.yaml", "--rays", "1000", "--json").json["sensors"] == 1
 
 
 # the guide

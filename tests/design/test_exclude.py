@@ -106,13 +106,6 @@ def test_the_admissible_mass_is_the_density_outside():
     assert found.admissible_mass == pytest.approx(SAMPLES.weights[outside].sum())
 
 
-def test_boxes_beyond_the_space_change_nothing():
-    free = fitted(count=2, origin=REGION)
-    far = fitted(count=2, origin={"exclude": [{"low_m": [3, -9, -9], "high_m": [5, 9, 9]}], **REGION})
-    assert places(far) == places(free)
-    assert far.log_likelihood == free.log_likelihood
-
-
 @pytest.mark.parametrize("axis", range(3))
 def test_flat_boxes_exclude_nothing_and_it_is_said(axis):
     box = {"low_m": [-0.5, -0.5, 0.5], "high_m": [0.5, 0.5, 1.5]}
@@ -194,17 +187,6 @@ def test_boxes_that_leave_no_place_are_refused_by_name(values, conflicts):
     with pytest.raises(InfeasibleError) as caught:
         fitted(**values)
     assert list(caught.value.conflicts) == conflicts
-
-
-@pytest.mark.parametrize("region", [{}, REGION], ids=["places", "regions"])
-def test_a_pinned_coordinate_is_in_a_box_or_not(region):
-    origin = {"low_m": [-1, -1, 0.4], "high_m": [1, 1, 0.4], "exclude": [PILLAR], **region}
-    found = fitted(count=2, origin=origin)
-    assert broken(found, origin=origin) == []
-    assert_outside(found, [PILLAR])
-    origin = {"low_m": [-1, -1, 1.8], "high_m": [1, 1, 1.8], **region}
-    above = fitted(count=2, origin=origin | {"exclude": [PILLAR]})
-    assert places(above) == places(fitted(count=2, origin=origin))
 
 
 @pytest.mark.parametrize("region", [{}, REGION], ids=["places", "regions"])

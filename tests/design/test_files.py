@@ -81,10 +81,6 @@ def test_a_saved_design_is_loaded_under_the_name_of_its_file(tmp_path):
     assert list(path.parent.iterdir()) == [path]
 
 
-def test_the_schema_is_a_valid_schema():
-    jsonschema.Draft202012Validator.check_schema(SCHEMA)
-
-
 @pytest.mark.parametrize("changes", [{"azimuth_rad": math.nan}, {"gate_m": (0.1, math.inf)}])
 def test_a_design_with_numbers_that_are_not_finite_is_not_written(tmp_path, changes):
     design = load_design(EXAMPLE)
@@ -270,11 +266,6 @@ def test_a_bad_file_is_refused_with_its_position_and_what_is_allowed(tmp_path, o
     assert caught.value.exit_code == 2
     assert f"bad.yaml{position}" in str(caught.value)
     assert says in str(caught.value)
-
-
-def test_the_good_file_of_the_table_of_bad_ones_is_good():
-    design = design_from_document(parse_yaml(GOOD, where="x").value)
-    assert (design.condition, design.counts, len(design.rays(at={"x_m": 0.3}))) == ("x_m", [2], 2)
 
 
 @pytest.mark.parametrize("version", [1, 0, -3])

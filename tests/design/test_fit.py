@@ -172,6 +172,13 @@ def test_every_sensor_rests_on_enough_effective_samples_or_the_fit_is_refused(ef
         assert effective_samples(found.sensors, few).min() >= LEAST_SAMPLES
 
 
+def test_a_sensor_that_would_rest_on_too_few_samples_is_named_with_how_many_there_are():
+    with pytest.raises(InfeasibleError, match=r"sensor \d+ of 12 would rest on 1?\d effective samples") as refused:
+        fitted(FIXED.subset(np.arange(150)), sensors=12)
+    assert refused.value.conflicts == ("--sensors",)
+    assert refused.value.allowed == f"at least {LEAST_SAMPLES:g}"
+
+
 def test_errors_of_a_fit_are_its_spread_over_other_samples():
     rules, repeats = {"gate": {"end_m": {"max": 0.65}}}, 60
     fits = [

@@ -8,6 +8,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from support.command_line import make_run
 
 from lidardesign.constraints.document import Constraints
@@ -457,11 +458,10 @@ def test_poses_multiply_along_links_frames_joints_and_nested_models(tmp_path, se
 
 def test_degrees_and_quaternions_are_the_same_poses(tmp_path):
     turn = np.array([20.0, -30.0, 100.0])
-    rotation = rotation_of_rpy(*np.radians(turn))
-    w = math.sqrt(1 + np.trace(rotation)) / 2
-    axis = np.array([rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]])
-    x, y, z = (axis / (4 * w)).tolist()
-    np.testing.assert_allclose(rotation_of_quaternion(3 * w, 3 * x, 3 * y, 3 * z), rotation, atol=EXACT)
+    x, y, z, w = Rotation.from_euler("xyz", turn, degrees=True).as_quat().tolist()
+    np.testing.assert_allclose(
+        rotation_of_quaternion(3 * w, 3 * x, 3 * y, 3 * z), rotation_of_rpy(*np.radians(turn)), atol=EXACT
+    )
     forms = [
         f'<pose degrees="true">1 2 3 {turn[0]} {turn[1]} {turn[2]}</pose>',
         f'<pose rotation_format="quat_xyzw">1 2 3 {x} {y} {z} {w}</pose>',

@@ -13,7 +13,7 @@ from scipy.stats import chi2
 from support.baselines import SceneBaselines
 from support.chi_square import UNLIKELY, counts_of_cells, mass_of_cells, p_value
 from support.designs import sensor
-from support.flows import FLOWS, draw, flow_of
+from support.flows import flow_of
 from support.mixtures import POINT, features_of, random_mixture
 from support.mixtures import drawn as drawn_from_mixture
 
@@ -28,8 +28,6 @@ from lidardesign.mixture.components import log_density
 from lidardesign.mixture.support import pin_samples, restrict_samples
 from lidardesign.numerics import systematic_draw
 from lidardesign.samples import Samples
-from lidardesign.scenes.scene import Body, Box, Capsule, Mesh, Scene, Sphere
-from lidardesign.scenes.surface import sample_body
 from lidardesign.scoring.baselines.simple import OccupancyGrid
 from lidardesign.sensors.pattern import even_rays, low_discrepancy
 from lidardesign.sensors.sensor import tangent_coordinates
@@ -83,22 +81,6 @@ def test_samples_of_a_flow_have_its_integrated_density(name, dtype):
         single = flow_of(name, layers=2, scale=scale).to(dtype)
         values, _ = single(base, None if context is None else context.to(dtype).expand(DRAWS, -1))
     assert_drawn(values.double().numpy(), edges_of(*sizes), of_flow(flow, context), inside)
-
-
-@pytest.mark.parametrize("name", FLOWS)
-def test_samples_weighted_by_their_inverse_density_measure_the_volume_of_every_part_of_the_box(name):
-    # in all dimensions together, where no grid reaches: the mean of 1 / p over samples inside a part is its volume
-    flow = flow_of(name, layers=2, scale=1.0)
-    base, context = draw(flow, DRAWS, seed=3)
-    with torch.no_grad():
-        values, log_prob = flow(base, context)
-        foreign = flow.log_prob(values, context)
-    part = (values > 0).long() @ (2 ** torch.arange(flow.features))
-    for density in (log_prob, foreign):
-        volume = torch.exp(-density).numpy()
-        for index in range(2**flow.features):
-            shares = np.where(part.numpy() == index, volume, 0.0)
-            assert abs(shares.mean() - 1.0) < 4.5 * shares.std() / math.sqrt(DRAWS), index
 
 
 def learned_in(space, seed=4):
@@ -355,65 +337,3 @@ def test_even_points_are_more_even_than_draws_in_every_pair_of_their_axes(axes, 
             counts = counts_of_cells(points[:, [second, first]], edges)
             # Pearson's statistic of independent draws falls below this once in a hundred times
             assert np.sum(np.square(counts - count / 100)) / (count / 100) < chi2.ppf(0.01, 99), (second, first)
-
-
-# --- surfaces: the share of each body's area between two heights, in closed form
-
-
-def of_sphere(height):
-    return np.clip((height + 0.5) / 1.0, 0, 1)
-
-
-def of_capsule(height):
-    # half a sphere at each end of a cylinder; all bands of one height have one area
-    return np.clip((height + 0.7) / 1.4, 0, 1)
-
-
-def of_box(height):
-    side, lid = 2 * 2 * (0.5 + 0.3), 4 * 0.5 * 0.3
-    total = side * 0.4 + 2 * lid
-    below = np.where(height >= -0.2, lid, 0.0) + side * np.clip(height + 0.2, 0, 0.4)
-    return (below + np.where(height >= 0.2, lid, 0.0)) / total
-
-
-def of_tetrahedron(height):
-    # three sides and a floor of equal area; a side's share below a height is 1 - (1 - z)^2
-    return (np.where(height >= 0, 1.0, 0.0) + 3 * (1 - np.square(1 - np.clip(height, 0, 1)))) / 4
-
-
-def tetrahedron():
-    radius = 1 / math.sqrt(2)  # of the floor's corners, for the height 1
-    turn = 2 * math.pi * np.arange(3) / 3
-    corners = np.column_stack([radius * np.cos(turn), radius * np.sin(turn), np.zeros(3)])
-    return Mesh(np.vstack([corners, [0, 0, 1.0]]), np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]))
-
-
-SHAPES = {
-    "sphere": (Sphere(0.5), of_sphere, -0.5, 0.5),
-    "capsule": (Capsule(0.3, 0.4), of_capsule, -0.7, 0.7),
-    "box": (Box((0.5, 0.3, 0.2)), of_box, -0.2, 0.2),
-    "mesh": (tetrahedron(), of_tetrahedron, 0.0, 1.0),
-}
-
-
-@pytest.mark.parametrize("name", SHAPES)
-def test_points_on_a_surface_are_uniform_in_its_area(name):
-    shape, below, low, high = SHAPES[name]
-    points = sample_body([Body(shape)], BOX, DRAWS, np.random.default_rng(17)).points
-    edges = np.linspace(low, high, 21)
-    edges[0], edges[-1] = low - 1e-9, high + 1e-9
-    turn = np.arctan2(points[:, 1], points[:, 0])
-    counts = np.histogram(points[:, 2], edges)[0]
-    assert p_value(counts, DRAWS * np.diff(below(edges))) > UNLIKELY
-    if name in ("sphere", "capsule"):
-        both = [edges, np.linspace(-math.pi, math.pi, 13)]
-        expected = np.multiply.outer(np.diff(below(edges)), np.full(12, 1 / 12)).ravel()
-        assert p_value(counts_of_cells(np.column_stack([points[:, 2], turn]), both), DRAWS * expected) > UNLIKELY
-
-
-def test_points_on_several_bodies_share_themselves_by_area():
-    scene = Scene((Body(Sphere(0.5)), Body(Box((0.5, 0.3, 0.2)))))
-    points = sample_body(scene.bodies, BOX, DRAWS, np.random.default_rng(18)).points
-    on_sphere = int((np.abs(np.linalg.norm(points, axis=1) - 0.5) < 1e-9).sum())
-    areas = np.array([math.pi, 8 * (0.15 + 0.06 + 0.1)])
-    assert p_value([on_sphere, DRAWS - on_sphere], DRAWS * areas / areas.sum()) > UNLIKELY

@@ -41,10 +41,6 @@ def spreads_of(sensor):
     return tuple(angle / (2 * Z) for angle in sensor.field_of_view_rad)
 
 
-def normal_gate(mean, spread):
-    return (max(mean - Z * spread, 0.0), mean + Z * spread)
-
-
 @settings(max_examples=60, deadline=None)
 @given(design=designs())
 def test_sensors_come_back_from_the_table(design, tmp_path_factory):
@@ -67,7 +63,7 @@ def test_an_azimuth_sigma_is_the_angle_that_it_spans_on_the_sphere(tmp_path, ele
     sensor = read_sensor_csv(path).sensors[0]
     beside = tangent_coordinates(sensor.frame, direction(np.array([3.14 + sigma]), np.array([elevation])))
     assert spreads_of(sensor)[0] == pytest.approx(beside[0, 0], rel=1e-6)
-    assert sensor.gate_m == pytest.approx(normal_gate(1.2, 0.3))
+    assert sensor.gate_m == pytest.approx((1.2 - Z * 0.3, 1.2 + Z * 0.3))
 
 
 def test_the_header_the_order_of_named_columns_and_a_byte_order_mark_do_not_matter(tmp_path):
@@ -131,17 +127,12 @@ def test_a_quarter_turn_of_roll_swaps_the_spreads_and_is_noted(tmp_path):
         (f"{HEADER}\n{ROW}\n{ROW.replace('0.3,1', '-0.3,1')}", ":3:15", "time_sigma"),
         (f"{HEADER}\n{ROW[:-1]}-1", ":2:16", "at least 0"),
         (f"{HEADER}\n{ROW[:-2]}", ":2", "15 columns"),
-        (f"{HEADER}\n{ROW},1,2", ":2", "18 columns"),
         (ROW.replace("0.1,1.2", "1.7,1.2"), ":1", "elevation_mean"),
         (ROW.replace("0.04,0.01", "0.04,0.9"), ":1", "eigenvalue"),
         (ROW[:-1] + "0", "", "sum to 0"),
         (ROW.replace(",0.3,1", ",0,1"), ":1", "no width"),
         (HEADER, "", "no sensor"),
-        (
-            f"{HEADER.replace('weight', 'wieght')}\n{ROW}",
-            ":1",
-            "missing columns: weight; unknown or repeated: wieght",
-        ),
+        (f"{HEADER.replace('weight', 'wieght')}\n{ROW}", ":1", "unknown or repeated: wieght"),
         (f"{HEADER.replace('weight', 'time_sigma')}\n{ROW}", ":1", "missing columns: weight"),
     ],
 )
