@@ -7,8 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from support import fits
 from support.command_line import make_run
 from support.sensors import normal_sensor
@@ -118,26 +116,9 @@ def test_flat_boxes_exclude_nothing_and_it_is_said(axis):
     assert notes == ("origin.exclude[0] has no volume and excludes nothing",)
 
 
-def test_each_sensor_may_have_boxes_of_its_own():
-    left, right = {"low_m": [-2, -2, -1], "high_m": [0, 2, 3]}, {"low_m": [0, -2, -1], "high_m": [2, 2, 3]}
-    values = {"origin": REGION, "each": [{"origin": {"exclude": [left]}}, {"origin": {"exclude": [right]}}]}
-    found = fitted(**values)
-    first, second = found.sensors
-    assert interval(first)[0][0] >= -1e-9
-    assert interval(second)[1][0] <= 1e-9
-    assert broken(found, **values) == []
-
-
 def test_an_entry_of_each_replaces_the_common_boxes():
     values = {"origin": {"exclude": [SLAB]}, "each": [{"origin": {"exclude": []}}, {}]}
     assert box_checks(fitted(**values), values) == ["s1.origin.exclude[0]"]
-
-
-def test_boxes_hold_together_with_spreads():
-    origin = {"exclude": [PILLAR], "spread_m": {"max": 0.3}, "thickness_m": {"max": 0.02}}
-    found = fitted(count=4, origin=origin)
-    assert_outside(found, [PILLAR])
-    assert broken(found, origin=origin) == []
 
 
 def test_mounts_in_an_excluded_box_are_dropped_and_it_is_said():
@@ -244,23 +225,3 @@ def test_boxes_are_given_by_option_and_by_file(call, tmp_path):
     assert rows[0]["bound"]["high_m"] == [0.6, 9, 9]
     shown = call("show", "run/designs/constrained.yaml")
     assert "low_m [-9, -9, -9], high_m [0.6, 9, 9]" in shown.out
-
-
-side = st.floats(-1.2, 1.2).map(lambda value: round(value, 3))
-corner = st.tuples(side, side, side.map(lambda value: value + 1))
-box = st.tuples(corner, corner).map(
-    lambda pair: {"low_m": np.minimum(*pair).tolist(), "high_m": np.maximum(*pair).tolist()}
-)
-
-
-@settings(max_examples=8, deadline=None)
-@given(st.lists(box, min_size=1, max_size=4), st.integers(1, 3), st.sampled_from([{}, REGION]))
-def test_whatever_the_boxes_nothing_is_inside_one(boxes, sensors, region):
-    origin = {"exclude": boxes, **region}
-    try:
-        found = fitted(count=sensors, origin=origin)
-    except InfeasibleError:
-        return
-    assert broken(found, origin=origin) == []
-    assert_outside(found, boxes)
-    assert not any(starting_in(one, candidates(found, 40, origin=origin)) for one in boxes)

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.command_line import make_run
 
 from lidardesign.errors import DataError
 from lidardesign.formats.designs import load_design
@@ -97,7 +96,7 @@ def test_xml_that_stops_anywhere_is_said_to_end_early(tmp_path):
         read_xml(path, "XML")
 
 
-def test_a_file_that_may_not_be_read_is_a_bad_file_like_one_that_is_not_there(call, tmp_path, monkeypatch):
+def test_a_file_that_may_not_be_read_is_a_bad_file_like_one_that_is_not_there(call, made, tmp_path, monkeypatch):
     (tmp_path / "rig.csv").write_text(GOOD)
 
     # whoever runs the tests may read everything
@@ -107,21 +106,18 @@ def test_a_file_that_may_not_be_read_is_a_bad_file_like_one_that_is_not_there(ca
         return open(path, *arguments)
 
     monkeypatch.setattr("lidardesign.run.inputs.open", refused, raising=False)
-    run = make_run(tmp_path / "run", count=100)
-    for arguments in (["show", "rig.csv"], ["evaluate", "rig.csv"], ["fit", run, "--like", "rig.csv"]):
+    for arguments in (["show", "rig.csv"], ["evaluate", "rig.csv"], ["fit", made, "--like", "rig.csv"]):
         result = call(*arguments)
-        assert result.code == 3, arguments
-        assert "Permission denied" in result.err
+        assert (result.code, "Permission denied" in result.err) == (3, True), arguments
     assert call("show", "none.csv").code == 3
 
 
-def test_files_that_only_their_endings_tell_apart_are_called_by_them(call, tmp_path):
-    run = make_run(tmp_path / "run", count=300)
+def test_files_that_only_their_endings_tell_apart_are_called_by_them(call, made, tmp_path):
     (tmp_path / "rig.csv").write_text(GOOD)
     (tmp_path / "rig.sdf").write_text(SDF)
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "rig.csv").write_text(GOOD)
-    options = ("--in", run, "--rays", 2, "--baseline", "none", "--json")
+    options = ("--in", made, "--rays", 2, "--baseline", "none", "--json")
     scored = call("evaluate", "rig.csv", "rig.sdf", *options)
     assert scored.code == 0, scored.err
     assert [row["design"] for row in scored.json["rows"]] == ["rig.csv", "rig.sdf"]

@@ -198,6 +198,10 @@ def test_rays_exactly_at_the_limit_are_within_reach(tmp_path):
     np.testing.assert_allclose(read_galvo(tmp_path / "f.csv").direction, looking, atol=1e-8)
 
 
+def with_last(text, line):
+    return "\n".join([*text.splitlines()[:-1], line, ""])
+
+
 BROKEN = {
     "another table": (lambda text: "a,b\n1,2\n", "not a ray list of the galvo format"),
     "an empty file": (lambda text: "", "not a ray list"),
@@ -206,14 +210,8 @@ BROKEN = {
     "a row cut short": (lambda text: text[:-9], ":61: "),
     "no number": (lambda text: text.replace(",0.4,", ",wide,", 1), ":2: .*wide"),
     "NaN": (lambda text: text.replace(",0.4,", ",nan,", 1), ":2: "),
-    "a negative gate": (
-        lambda text: text[: text.rindex("\n", 0, -1)] + "\n59,0,0,0,0,0,0,0,0,-5,1,0,59\n",
-        "gate_start",
-    ),
-    "mirrors beyond reach": (
-        lambda text: text[: text.rindex("\n", 0, -1)] + "\n59,0,0,0,0,0,0,70,0,5,1,0,59\n",
-        "x_deg is 70",
-    ),
+    "a negative gate": (lambda text: with_last(text, "59,0,0,0,0,0,0,0,0,-5,1,0,59"), "gate_start"),
+    "mirrors beyond reach": (lambda text: with_last(text, "59,0,0,0,0,0,0,70,0,5,1,0,59"), "x_deg is 70"),
 }
 
 
