@@ -152,14 +152,6 @@ def test_a_fixed_pattern_has_no_further_rays(layout):
         fixed(60, layout).rays(61)
 
 
-def test_two_rays_of_a_sensor_with_different_gates_have_gates_of_their_own():
-    assert not EVEN.has_gates_per_ray
-    assert not chosen(5, 20).has_gates_per_ray
-    pattern = chosen(20).patterns[0]
-    wider = pattern.gate_m + np.where(np.arange(20) == 7, 0.1, 0.0)[:, None] * [0, 1]
-    assert replace(chosen(5), patterns=(*chosen(5).patterns, replace(pattern, gate_m=wider))).has_gates_per_ray
-
-
 # --- where
 
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from support.strategies import conditions, length, patterns, sensors
 
 from lidardesign.api.config_reference import schema_of
-from lidardesign.errors import ConfigError, DataError, NumericalError
+from lidardesign.errors import ConfigError, NumericalError
 from lidardesign.formats.designs import load_design
 from lidardesign.run.inputs import DESIGN
 from lidardesign.run.yaml import dump_yaml, parse_yaml
@@ -320,10 +320,3 @@ def test_a_file_that_is_no_design_is_refused(tmp_path, content):
     path.write_text(content)
     with pytest.raises(ConfigError, match=r"other\.yaml"):
         load_design(path)
-
-
-def test_a_missing_file_and_a_folder_are_bad_data(tmp_path):
-    for path in (tmp_path / "none.yaml", tmp_path):
-        with pytest.raises(DataError, match="cannot be read") as caught:
-            load_design(path)
-        assert caught.value.exit_code == 3

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 from support.sensors import normal_sensor
 
 from lidardesign.errors import ConfigError, DataError
@@ -42,19 +43,13 @@ def mirrored(beam, normal):
     return beam - 2 * (beam @ normal) * normal
 
 
-def turned(axis, angle, vector):
-    """Rodrigues' rotation."""
-    along = axis * (axis @ vector)
-    return along + np.cos(angle) * (vector - along) + np.sin(angle) * np.cross(axis, vector)
-
-
 def through_two_mirrors(x_deg, y_deg):
     """A beam that meets an x and a y mirror at one place, by the law of reflection; mirrors turn by half the angles."""
     forward, sideways, upward = np.eye(3)
     between = upward  # from the x mirror up to the y mirror
     x_axis, y_axis = -forward, -sideways
-    x_mirror = turned(x_axis, np.radians(x_deg) / 2, (between - sideways) / np.sqrt(2))
-    y_mirror = turned(y_axis, np.radians(y_deg) / 2, (forward - between) / np.sqrt(2))
+    x_mirror = Rotation.from_rotvec(x_axis * np.radians(x_deg) / 2).apply((between - sideways) / np.sqrt(2))
+    y_mirror = Rotation.from_rotvec(y_axis * np.radians(y_deg) / 2).apply((forward - between) / np.sqrt(2))
     return mirrored(mirrored(sideways, x_mirror), y_mirror)
 
 

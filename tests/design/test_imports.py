@@ -294,7 +294,6 @@ def test_a_model_may_include_files_of_its_own_folder_alone(tmp_path):
 DOCTYPE = '<!DOCTYPE m [<!ENTITY a "aaaaaaaaaa"><!ENTITY b SYSTEM "file:///etc/passwd">]>'
 BAD_XML = {
     "a document type": (DOCTYPE + model_of('<rangefinder site="a" cutoff="1"/>'), "document type"),
-    "cut short": (model_of("")[:-9], "ends early"),
     "no rangefinder": (model_of(""), "has no rangefinder"),
     "an unknown site": (model_of('<rangefinder site="b" cutoff="1"/>'), "MuJoCo cannot read it"),
     "a camera": (model_of('<rangefinder camera="c"/>', '<camera name="c"/>'), "on a camera"),
@@ -307,7 +306,6 @@ BAD_XML = {
     "another model": (model_of("", '<attach model="x"/>'), "attaches another model"),
     "no end": (model_of('<rangefinder site="a"/>'), "does not say how far 1 of its 1 rays reach"),
     "a URDF": ("<robot name='r'/>", "root element is '<robot>'"),
-    "a page": ("<html></html>", "root element is '<html>'"),
     "nesting": ("<mujoco>" + "<body>" * 300 + "</body>" * 300 + "</mujoco>", "nested too deep"),
     "no lidar": ("<sdf><model name='m'><link name='l'/></model></sdf>", "has no lidar"),
     "an included model": ("<sdf><world><include><uri>x</uri></include></world></sdf>", "includes are not read"),
@@ -578,13 +576,8 @@ def test_formats_of_sensors_take_no_number_of_rays(call, tmp_path, name):
 
 def test_sensors_like_a_planar_scanner_stay_planar():
     """A field of view of no height is one: only a single ray has none that could be a bound."""
-    fields = {
-        "fan": (1.0, 0.0),
-        "wall": (0.0, 0.5),
-        "turn": (2 * math.pi, 0.0),
-        "ball": (2 * math.pi, 7.0),
-        "ray": (0, 0),
-    }
+    turn = 2 * math.pi
+    fields = {"fan": (1.0, 0.0), "wall": (0.0, 0.5), "turn": (turn, 0.0), "ball": (turn, 7.0), "ray": (0, 0)}
     sensors = tuple(Sensor(name, 0.2, np.zeros(3), 0.0, 0.0, 0.0, field, (0.6, 1.4)) for name, field in fields.items())
     space = DesignSpace((0,) * 3 + (0, -1.5, 0), (0,) * 3 + (6, 1.5, 9))
     found = rig_constraints(DesignSpec("rig", sensors), space, Constraints(), rays=None).as_document()["each"]

@@ -11,7 +11,6 @@ from support import references
 from support.designs import from_the_ceiling
 from support.fits import broken, fitted
 
-from lidardesign.numerics import clipped_eigenvalues
 from lidardesign.samples import Samples
 from lidardesign.sensors.pattern import even_rays
 from lidardesign.sensors.sensor import boresight_frame, interval_factor, tangent_directions
@@ -95,19 +94,3 @@ def test_the_thickness_of_a_region_is_bounded_along_its_thinnest_direction_alone
     assert abs(np.linalg.eigh(thin.sensors[0].covariance_m2)[1][:, 0] @ axes[:, 2]) > 0.99
     assert broken(thin, rules, CUBE) == []
     assert broken(free, rules, CUBE) == ["s0.origin.thickness_m.max"]
-
-
-def test_lowering_the_least_eigenvalue_is_the_best_covariance_of_bounded_thickness():
-    generator = np.random.default_rng(7)
-    root = generator.normal(size=(3, 3))
-    scatter = root @ root.T
-    limit = 0.5 * np.linalg.eigvalsh(scatter)[0]
-
-    def likelihood(covariance):
-        return -np.linalg.slogdet(covariance)[1] - np.trace(np.linalg.solve(covariance, scatter))
-
-    best = likelihood(clipped_eigenvalues(scatter, 0.0, np.inf, limit))
-    for _ in range(300):
-        other = generator.normal(size=(3, 3))
-        other = clipped_eigenvalues(other @ other.T + scatter, 1e-3, np.inf, limit)
-        assert likelihood(other) <= best + 1e-9

@@ -302,18 +302,6 @@ def test_rgl_takes_patterns_ranges_and_rates_at_their_ends(tmp_path, rate_hz):
 # libs/qCC_io/src/PlyFilter.cpp; source/blender/io/ply/importer/ply_import_data.cc
 
 
-def properties(path):
-    """Names of each element's properties, by the header."""
-    found = {}
-    for line in path.read_bytes().partition(b"end_header")[0].decode("ascii").splitlines():
-        words = line.split()
-        if words[0] == "element":
-            found[words[1]] = []
-        elif words[0] == "property":
-            found[list(found)[-1]].append(words[-1])
-    return found
-
-
 def cloudcompare(element, names):
     """What CloudCompare takes each property for, before it asks."""
     found = {}
@@ -330,17 +318,13 @@ def cloudcompare(element, names):
     return found
 
 
-@pytest.fixture(scope="module")
-def points(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("ply")
-    EXPORTERS["ply"].write(ONE, rays_along(FORWARD, np.array([[0.0, 9.0]])), folder)
-    return folder
-
-
-def test_cloudcompare_knows_every_property_of_the_points(points):
-    names = properties(points / "rays.ply")["vertex"]
+def test_cloudcompare_knows_every_property_of_the_points(tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    EXPORTERS["ply"].write(ONE, rays_along(FORWARD, (0.0, 9.0)), tmp_path)
+    points, beams = (trimesh.load(tmp_path / f"{name}.ply").metadata["_ply_raw"] for name in ("rays", "beams"))
+    names = list(points["vertex"]["properties"])
     known = cloudcompare("vertex", names)
     assert [known[name.upper()] for name in names] == [
         *("X", "Y", "Z", "NX", "NY", "NZ", "RED", "GREEN", "BLUE"), *("scalar",) * 4
     ]  # fmt: skip
-    assert set(cloudcompare("edge", properties(points / "beams.ply")["edge"]).values()) == {None}
+    assert set(cloudcompare("edge", beams["edge"]["properties"]).values()) == {None}

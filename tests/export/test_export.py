@@ -10,15 +10,11 @@ from lidardesign.errors import DataError
 from lidardesign.formats.registry import EXPORTERS
 from lidardesign.sensors.design import DesignSpec
 
-
-def design(count=2):
-    sensors = tuple(
-        normal_sensor(
-            f"s{i}, größe", 1 / count, (0.1 * i, -0.2, 1 / 3), i * 2.0, -0.7 * i, origin_covariance_m2=np.eye(3)
-        )
-        for i in range(count)
-    )
-    return DesignSpec("two", sensors, constraints={"gate": {"width_m": {"max": 1.0}}, "budget": {"rays": 37}})
+SENSORS = tuple(
+    normal_sensor(f"s{i}, größe", 0.5, (0.1 * i, -0.2, 1 / 3), i * 2.0, -0.7 * i, origin_covariance_m2=np.eye(3))
+    for i in range(2)
+)
+DESIGN = DesignSpec("two", SENSORS, constraints={"gate": {"width_m": {"max": 1.0}}, "budget": {"rays": 37}})
 
 
 def read_csv(path):
@@ -35,9 +31,9 @@ def read_npz(path):
 @pytest.mark.parametrize(("name", "read"), [("csv", read_csv), ("npz", read_npz)])
 @pytest.mark.parametrize("count", [0, 1, 37])
 def test_a_ray_list_comes_back_to_the_last_bit(tmp_path, name, read, count):
-    rays = design().rays(count)
+    rays = DESIGN.rays(count)
     path = tmp_path / "out"
-    notes = EXPORTERS[name].write(design(), rays, path)
+    notes = EXPORTERS[name].write(DESIGN, rays, path)
     columns = read(path)
     np.testing.assert_array_equal(np.stack([columns[f"origin_{a}_m"] for a in "xyz"], 1), rays.origin_m)
     np.testing.assert_array_equal(np.stack([columns[f"direction_{a}"] for a in "xyz"], 1), rays.direction)
@@ -61,10 +57,10 @@ def test_every_format_is_written_whole_or_not_at_all(tmp_path, name):
     assert exporter.name == name
     assert exporter.suffix.startswith(".")
     path = tmp_path / f"a design{exporter.suffix}"
-    exporter.write(design(), design().rays(), path)
+    exporter.write(DESIGN, DESIGN.rays(), path)
     assert path.is_dir() == exporter.folder
     first = contents(path)
-    exporter.write(design(), design().rays(), path)
+    exporter.write(DESIGN, DESIGN.rays(), path)
     assert contents(path) == first
     assert list(tmp_path.iterdir()) == [path]
 
@@ -77,5 +73,5 @@ def test_a_file_is_never_written_over_a_folder_nor_a_folder_over_a_file(tmp_path
     else:
         path.mkdir()
     with pytest.raises(DataError, match="taken"):
-        exporter.write(design(), design().rays(), path)
+        exporter.write(DESIGN, DESIGN.rays(), path)
     assert contents(path) == ({".": b"mine"} if exporter.folder else {})

@@ -220,7 +220,6 @@ def test_a_fingerprint_is_of_the_content_alone():
     def scene(name="a", radius=0.2, **truth):
         return Scene((Body(Sphere(radius), name),), name, truth=truth)
 
-    assert fingerprint(scene()) == fingerprint(scene())
     assert fingerprint(scene(x=1, y={"b", "a"})) == fingerprint(scene(y={"a", "b"}, x=1))
     assert fingerprint(scene(x=np.zeros(2))) != fingerprint(scene(x=np.zeros(3)))
     assert fingerprint(scene(x=1)) != fingerprint(scene(x=1.0))
@@ -232,10 +231,6 @@ def test_a_fingerprint_is_of_the_content_alone():
     before = fingerprint(mesh)
     assert mesh.content_hash
     assert fingerprint(mesh) == before
-    loop: list[object] = []
-    loop.append(loop)
-    with pytest.raises(RecursionError):
-        fingerprint(loop)
 
 
 def test_sensors_are_on_a_body_with_a_name_or_in_the_world():

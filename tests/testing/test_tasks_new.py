@@ -151,10 +151,9 @@ def test_a_name_that_is_none_or_taken_is_refused_and_nothing_is_written(tmp_path
 
 def test_a_folder_that_holds_something_is_left_alone(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(DataError, match="already exists"):
-        new_task("landmark", tmp_path)
-    with pytest.raises(DataError, match="already exists"):
-        new_task("landmark", tmp_path / "notes.txt")
+    for place in (tmp_path, tmp_path / "notes.txt"):
+        with pytest.raises(DataError, match="already exists"):
+            new_task("landmark", place)
     assert files_under(tmp_path) == {"notes.txt": b"mine"}
 
 
