@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from support import fits
-from support.command_line import make_run
 from support.sensors import normal_sensor
 
 from lidardesign.constraints.check import check_design
@@ -198,18 +196,16 @@ def test_far_from_the_origin_of_coordinates_nothing_changes(region):
     [(0.0, 0.0, ["s1.origin.exclude[0]"]), (0.7, 0.1, []), (0.7, 0.11, ["s1.origin.exclude[0]"])],
 )
 def test_a_mean_in_a_box_and_an_interval_that_reaches_into_it_are_seen(mean_x, spread_x, names):
-    sensors = (normal_sensor("s0", 0.5, (0.7, 0, 1)), normal_sensor("s1", 0.5, (mean_x, 0, 1)))
-    covariance = np.diag([spread_x**2, 0, 0])
-    sensors = (sensors[0], replace(sensors[1], origin_covariance_m2=covariance))
+    moved = normal_sensor("s1", 0.5, (mean_x, 0, 1), origin_covariance_m2=np.diag([spread_x**2, 0, 0]))
+    sensors = (normal_sensor("s0", 0.5, (0.7, 0, 1)), moved)
     checks = check_design(design_document(DesignSpec("d", sensors)), {"origin": {"exclude": [PILLAR]}}, ROOM)
     assert [check.name for check in checks if not check.satisfied and "exclude" in check.name] == names
 
 
-def test_boxes_are_given_by_option_and_by_file(call, tmp_path):
-    make_run(tmp_path / "run")
+def test_boxes_are_given_by_option_and_by_file(call, flat, tmp_path):
     (tmp_path / "rules.yaml").write_text("origin:\n  exclude: [{low_m: [-9, -9, -9], high_m: [0.5, 9, 9]}]\n")
     options = ["--constraints", "rules.yaml", "--set", "origin.exclude.0.high_m=[0.6, 9, 9]"]
-    result = call("constrain", "run", "--layout", "even", "--sensors", 2, *options, "--json")
+    result = call("constrain", flat, "--layout", "even", "--sensors", 2, *options, "--json")
     assert result.code == 0, result.err
     rows = [row for row in result.json["constraints"] if "exclude" in row["name"]]
     assert len(rows) == 2

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from concurrent.futures import ThreadPoolExecutor
 
@@ -105,7 +104,6 @@ def test_none_of_them_is_imported_here_or_spoils_the_others(findings, place, tmp
 def test_an_unknown_task_and_a_refused_configuration_are_the_users_errors(place, tmp_path, monkeypatch, capsys):
     with pytest.raises(ConfigError, match="did you mean 'good'"):
         list(check_in_process(CheckRequest("god")))
-    call = caller(capsys, tmp_path, monkeypatch)
-    result = call("tasks", "check", "good", "--set", "no_such_key=1", "--json")
+    result = caller(capsys, tmp_path, monkeypatch)("tasks", "check", "good", "--set", "no_such_key=1", "--json")
     assert result.code == 2
-    assert json.loads(result.out)["error"]["where"] == "--set no_such_key=1"
+    assert result.json["error"]["where"] == "--set no_such_key=1"
