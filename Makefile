@@ -5,11 +5,12 @@
 # make test-arithmetic  runs the commands of the docs with the arithmetic of a plain processor, two minutes
 # make test-pythons  installs and tests the core with every other Python that is found, four minutes each
 # make dist   builds sdist and wheel, installs the wheel with every Python that is found and runs the demo with it, ten minutes
-# make fuzz   reads 100,000 damaged files, an hour on two cores; the result goes to docs/soak; AMOUNT=N reads fewer
+# make fuzz   reads 100,000 damaged files, an hour on two cores; the result goes to docs/soak
 # make coverage  measures the lines and branches that the tests take, an hour
 # make mutation  changes the core's code in a thousand small ways and counts what its tests notice; to docs/soak
 # make soak   all long runs, a night on two cores: random whole runs, many seeds, kills, then fuzz and mutation; each
-#             also alone, as make soak-runs, soak-seeds and soak-kills; dated results go to docs/soak
+#             also alone, as make soak-runs, soak-seeds and soak-kills; dated results go to docs/soak; with AMOUNT=N
+#             fuzz, mutation (of each module) and each of these do N inputs, mutants, runs, seeds, kills or plans
 # make soak-promise  makes 2,000 random plans of effects and looks whether they keep what they promise, ten minutes
 #             what is interrupted (also fuzz, mutation and coverage) goes on when it is started again at the same commit
 # make clean  takes all of it away again
@@ -23,7 +24,7 @@ export OMP_WAIT_POLICY ?= PASSIVE
 
 # Long runs do so many things at once
 JOBS ?= 2
-LONG := PYTHONPATH=tests $(BIN)/python -m pytest -p support.long_runs -m long -n $(JOBS) --maxschedchunk 1 \
+LONG := $(BIN)/python -m pytest -p tests.conftest -p benchmarks.soak.long_runs -m long -n $(JOBS) --maxschedchunk 1 \
 	--max-worker-restart 100 -o tmp_path_retention_policy=failed --page docs/soak
 
 .PHONY: demo test docs dist consumers setup system-programs test-arithmetic test-pythons coverage mutation lint fuzz soak soak-benchmarks soak-runs soak-seeds soak-kills soak-promise clean
@@ -103,13 +104,13 @@ coverage: $(BIN)/.dev
 
 # Small changes of the core's code, and how many of them its tests notice: an hour
 mutation: $(BIN)/.dev
-	$(BIN)/python tools/mutation.py --out docs/soak/mutation-$$(date -u +%F).md
+	$(BIN)/python tools/mutation.py --out docs/soak/mutation-$$(date -u +%F).md $(if $(AMOUNT),--sample $(AMOUNT))
 
 lint: $(BIN)/.dev
 	$(BIN)/python -m ruff check --no-cache .
 
 fuzz: $(BIN)/.dev
-	$(LONG) tests/fuzz --amount $(or $(AMOUNT),100000)
+	$(LONG) benchmarks/soak/fuzz.py --amount $(or $(AMOUNT),100000)
 
 soak: soak-benchmarks soak-runs soak-seeds soak-kills fuzz mutation
 
@@ -119,19 +120,20 @@ soak-benchmarks: $(BIN)/.dev
 
 # 300 runs of random configurations, some 200 of them whole: no fault, every constraint kept, the same bytes when done again
 soak-runs: $(BIN)/.dev
-	$(LONG) tests/soak/test_long_runs.py --amount $(or $(AMOUNT),300)
+	$(LONG) benchmarks/soak/runs.py --amount $(or $(AMOUNT),300)
 
 # The face and the arm at draft and standard from 20 seeds each: every one learns well enough
 soak-seeds: $(BIN)/.dev
-	$(LONG) tests/soak/test_long_seeds.py --amount $(or $(AMOUNT),20)
+	$(LONG) benchmarks/soak/seeds.py --amount $(or $(AMOUNT),20)
 
-# Learning, fitting and evaluating are killed at random moments: what is left can be read, and going on repeats the bytes
+# Learning, fitting and evaluating are killed at all steps and random moments: what is left can be read, and going on
+# repeats the bytes. Processes are forked, which workers with threads cannot do.
 soak-kills: $(BIN)/.dev
-	PYTHONPATH=tests $(BIN)/python -m faults.kills --out docs/soak/kills-$$(date -u +%F).md
+	$(LONG) -n 0 benchmarks/soak/kills.py --amount $(or $(AMOUNT),1650)
 
 # 2,000 random plans: nothing that is skipped changes more than is tolerated
 soak-promise: $(BIN)/.dev
-	$(LONG) tests/soak/test_long_promise.py --amount $(or $(AMOUNT),2000)
+	$(LONG) benchmarks/soak/promise.py --amount $(or $(AMOUNT),2000)
 
 clean:
 	rm -rf $(VENV) build dist runs *.egg-info

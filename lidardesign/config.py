@@ -21,7 +21,7 @@ from lidardesign.registry import UnknownTaskError, load_task, plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.run.manifest import read_manifest, verify, write_recorded
 from lidardesign.run.validation import Override, anchor_paths, apply_override, check_model, is_name, parse_overrides
-from lidardesign.run.yaml import Document, KeyPath, dump_yaml, leaves, load_yaml
+from lidardesign.run.yaml import Document, KeyPath, dump_yaml, leaves, load_yaml, merged
 from lidardesign.space import DIMENSIONS, FARTHEST_M, SHORTEST_M, DesignSpace
 from lidardesign.task import Task, TaskConfig
 
@@ -191,7 +191,7 @@ class _Layers:
 
     def merge(self, section: str, values: Mapping[str, Any], origin: str) -> None:
         """Merge values into a section, and keep their origin."""
-        _merge(self.values.setdefault(section, {}), values)
+        self.values[section] = merged(self.values.get(section, {}), values)
         for path, _ in leaves(dict(values)):
             self.origins[(section, *path)] = origin
 
@@ -373,7 +373,7 @@ def _lay_file(layers: _Layers, task: Task, document: Document) -> None:
             )
         if is_of_run and section == "learning":
             values = {key: value for key, value in values.items() if key not in RETIRED}
-        _merge(layers.values[section], values)
+        layers.values[section] = merged(layers.values[section], values)
         for path, _ in leaves(values, (section,)):
             for length in range(2, len(path) + 1):
                 layers.origins[path[:length]] = document.locate(path[:length])
@@ -456,11 +456,3 @@ def _space(task: Task, config: TaskConfig, layers: _Layers) -> DesignSpace:
         raise ConfigError(
             f"{'.'.join(map(str, path))}: {error.message}", where=layers.origin(path), allowed=error.allowed
         ) from None
-
-
-def _merge(base: dict[str, Any], values: Mapping[str, Any]) -> None:
-    for key, value in values.items():
-        if isinstance(value, Mapping) and isinstance(base.get(key), dict):
-            _merge(base[key], value)
-        else:
-            base[key] = dict(value) if isinstance(value, Mapping) else value

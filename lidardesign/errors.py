@@ -185,13 +185,21 @@ class ThresholdError(LidardesignError):
     exit_code, kind = 1, "threshold"
 
 
-def is_out_of_memory(error: BaseException) -> bool:
+def text_of(error: BaseException) -> str:
+    """Message of an error in one line, even if its class fails to make one."""
+    try:
+        return " ".join(str(error).split()) or "no message"
+    except Exception:
+        return "no message"
+
+
+def lacks_memory(error: BaseException) -> bool:
     """True for errors that say so by their class, number or text, as those of torch and of compiled libraries do."""
     return (
         isinstance(error, MemoryError)
         or type(error).__name__ == "OutOfMemoryError"
         or getattr(error, "errno", None) == errno.ENOMEM
-        or any(words in str(error).lower() for words in NO_MEMORY)
+        or any(words in text_of(error).lower() for words in NO_MEMORY)
     )
 
 

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from importlib.metadata import EntryPoint, distributions, entry_points
 from typing import Any, NoReturn
 
-from lidardesign.errors import ConfigError, DataError, LidardesignError, PluginError, is_out_of_memory
+from lidardesign.errors import ConfigError, DataError, LidardesignError, PluginError, lacks_memory, text_of
 from lidardesign.run.child import START_SECONDS, Child, ChildError
 from lidardesign.run.clock import phase
 from lidardesign.task import API_VERSION, Defaults, Metric, Task, TaskConfig
@@ -160,7 +160,7 @@ def plugin_guard(name: str) -> Iterator[None]:
     except SystemExit as error:
         raise PluginError(f"tried to end the program (exit {error.code})", where=f"task {name}") from error
     except BaseException as error:
-        if is_out_of_memory(error):
+        if lacks_memory(error):
             raise MemoryError from error
         if isinstance(error, OSError) and error.filename is not None:
             reason, hint = error.strerror or type(error).__name__, f"the task {name} reads it: check the path"
@@ -203,14 +203,6 @@ def plugin_method(name: str, method: str, where: str) -> Iterator[None]:
             yield
     except PluginError as error:
         raise PluginError(f"{method} failed: {error.message}", where=where, hint=error.hint) from error
-
-
-def text_of(error: BaseException) -> str:
-    """Message of an error in one line, even if its class fails to make one."""
-    try:
-        return " ".join(str(error).split()) or "no message"
-    except Exception:
-        return "no message"
 
 
 def _entry_points_by_name() -> dict[str, list[EntryPoint]]:

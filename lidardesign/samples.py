@@ -85,8 +85,8 @@ class Samples:
         _, same = np.unique(places, axis=0, return_inverse=True)
         return float(1.0 / np.square(np.bincount(same.reshape(-1), self.weights)).sum())
 
-    def subset(self, keep: np.ndarray) -> Samples:
-        """The samples at an index or mask."""
+    def subset(self, keep: np.ndarray | slice) -> Samples:
+        """The samples at an index, a slice or a mask."""
         return Samples(self.points[keep], self.log_prob[keep], self.log_target[keep], self.space)
 
     def resample(self, count: int, generator: np.random.Generator) -> np.ndarray:

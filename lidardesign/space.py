@@ -142,6 +142,11 @@ class DesignSpace:
         """Indices of the free dimensions that the density is conditioned on."""
         return tuple(i for i in self.free if DIMENSIONS[i] in self.condition)
 
+    @property
+    def turns(self) -> bool:
+        """True if both angles are free, so that rays can be aimed at any point."""
+        return {AZIMUTH, ELEVATION} <= set(self.free)
+
     @cached_property
     def full_azimuth(self) -> bool:
         """True if the azimuth covers the full turn, so that it is periodic."""

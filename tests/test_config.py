@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 from pydantic import Field, model_validator
-from support.tables import each_row
 
 from lidardesign import config as config_module
 from lidardesign.config import (
@@ -212,7 +211,7 @@ BAD_OVERRIDES = {
 }
 
 
-@each_row("override", BAD_OVERRIDES)
+@pytest.mark.parametrize("override", BAD_OVERRIDES)
 def test_errors_in_an_override_show_it(override):
     with pytest.raises(ConfigError) as caught:
         resolve(TASK, overrides=[override])
@@ -220,7 +219,7 @@ def test_errors_in_an_override_show_it(override):
     assert BAD_OVERRIDES[override] in str(caught.value)
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("section", "key"),
     [
         *(("density", key) for key in DensitySettings.model_fields),
@@ -306,7 +305,7 @@ def test_a_run_is_judged_by_other_values_of_its_task_and_keeps_the_rest():
     assert with_task_settings(TASK, config, []) == config
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("override", "message"),
     [
         ("count=4", "design space"),
@@ -323,7 +322,9 @@ def test_what_was_learned_stays_when_a_run_is_judged(override, message):
     assert override in str(caught.value.where)
 
 
-@each_row("texts", [("a=1", "a=2"), ("task.a=1", "a=2"), ("a.b=1", "a={b: 2}"), ("a={b: 1}", "b=1", "a.b.c=2")])
+@pytest.mark.parametrize(
+    "texts", [("a=1", "a=2"), ("task.a=1", "a=2"), ("a.b=1", "a={b: 2}"), ("a={b: 1}", "b=1", "a.b.c=2")]
+)
 def test_a_key_that_is_set_twice_is_refused(texts):
     with pytest.raises(ConfigError, match="is already set by --set") as caught:
         parse_overrides(texts)
@@ -331,7 +332,7 @@ def test_a_key_that_is_set_twice_is_refused(texts):
     assert len(parse_overrides(["d.b=1", "d.c=1", "db=2", *texts[:1], *texts[:1]])) == 5
 
 
-@each_row("text", [".".join("a" * count) + "=1" for count in (33, 500, 5000)])
+@pytest.mark.parametrize("text", [".".join("a" * count) + "=1" for count in (33, 500, 5000)])
 def test_a_key_of_many_parts_is_refused(text):
     with pytest.raises(ConfigError, match=r"(?s)has \d+ parts.*at most 32"):
         parse_override(text)
@@ -354,6 +355,6 @@ MODELS = [DensitySettings, LearningSettings, Constraints, PartFile]
 MODELS += [load_task(item.name).Config for item in list_tasks() if item.distribution.startswith("lidardesign ")]
 
 
-@each_row("model", MODELS)
+@pytest.mark.parametrize("model", MODELS)
 def test_every_number_that_a_user_sets_has_limits(model):
     assert not list(unlimited(model.model_json_schema()))

@@ -236,6 +236,37 @@ def test_exported_names_exist():
     assert not missing
 
 
+def described(node: ast.FunctionDef | ast.ClassDef) -> set[str]:
+    """The names under "Arguments:" of a docstring."""
+    section = re.search(r"^Arguments:\n((?:    .*\n?|\n)+)", ast.get_docstring(node) or "", re.MULTILINE)
+    lines = re.findall(r"^    ([a-z_]\w*(?:, \w+)*):", section[1], re.MULTILINE) if section else []
+    return {name for line in lines for name in line.split(", ")}
+
+
+def taken_by(node: ast.FunctionDef | ast.ClassDef) -> set[str]:
+    """The names of what a function or a dataclass takes."""
+    if isinstance(node, ast.FunctionDef):
+        all_ = node.args.posonlyargs + node.args.args + node.args.kwonlyargs
+        return {one.arg for one in [*all_, node.args.vararg, node.args.kwarg] if one} - {"self", "cls"}
+    own = [one.target.id for one in node.body if isinstance(one, ast.AnnAssign)]
+    made = [one for one in node.body if isinstance(one, ast.FunctionDef) and one.name == "__init__"]
+    return {*own, *(name for one in made for name in taken_by(one))}
+
+
+def test_docstrings_describe_all_that_functions_take_and_nothing_else():
+    wrong = {}
+    for name, tree in trees().items():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.FunctionDef | ast.ClassDef) and described(node):
+                apart = described(node) ^ taken_by(node)
+                # fields of a base are described where it is, and some fields only there
+                if isinstance(node, ast.ClassDef):
+                    apart = set() if node.bases else described(node) - taken_by(node)
+                if apart:
+                    wrong[f"{name}.{node.name}"] = apart
+    assert not wrong
+
+
 def weak(name: str) -> bool:
     return bool(EMPTY_WORDS & set(name.strip("_").split("_")[:1]))
 

@@ -24,8 +24,8 @@ def parts() -> list[list[str]]:
 
 def main() -> int:
     """Run what is not done, and combine; raises where tests fail."""
-    sys.path.insert(0, str(ROOT / "tests"))
-    from support.long_runs import OURS, kept
+    sys.path.insert(0, str(ROOT))
+    from benchmarks.soak.long_runs import OURS, kept
 
     data = OURS / "coverage"
     data.mkdir(parents=True, exist_ok=True)

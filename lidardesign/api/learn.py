@@ -91,6 +91,9 @@ class LearnOptions:
         check_choice(self.device, "--device", ("auto", "cpu", "cuda"))
         if self.tolerance is not None:
             check_number(self.tolerance, "--tolerance", *TOLERANCES)
+            said = [text for text in settings_texts(self.settings) if text.startswith("learning.misplaced=")]
+            if said:
+                raise ConfigError(f"beside --set {said[0]}", where="--tolerance", allowed="one of the two")
         if self.time_budget_s is not None:
             check_number(self.time_budget_s, "--time-budget", *TIME_BUDGETS_S)
 

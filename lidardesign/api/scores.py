@@ -96,7 +96,11 @@ class ScoreOptions:
         self.misplacement()
         if NONE in self.baselines:
             if len(self.baselines) > 1 or self.fail_unless_better in BASELINES:
-                raise ConfigError("none together with another baseline", where="--baseline", allowed="none alone")
+                raise ConfigError(
+                    "none together with another baseline, of this or of --fail-unless-better",
+                    where="--baseline",
+                    allowed="none alone",
+                )
         else:
             for name in self.baselines:
                 check_baseline(name, where="--baseline")

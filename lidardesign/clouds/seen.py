@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lidardesign.clouds.ros import NANOSECONDS
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.numerics import COARSE_SLACK, SLACK
 from lidardesign.report.scene_figure import own_triangles, scene_bounds
@@ -32,7 +33,6 @@ COLUMNS = (
     ("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("t", "<u4"), ("ring", "<u2"), ("outcome", "u1"),
     ("occluder", "u1"), ("ray", "<u4"),
 )  # fmt: skip
-NANOSECONDS = 1e9
 LONGEST_SHARE, MOST_TRIANGLES = 1 / 16, 500_000  # of a body's extent, in which what is seen is told; of a body
 
 

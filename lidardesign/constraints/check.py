@@ -73,7 +73,6 @@ def check_design(document: Mapping[str, Any], constraints: Any, space: Any = Non
     bounds = space.as_dict() if hasattr(space, "as_dict") else space
     level = float(document.get("level", 0.95))
     z = NormalDist().inv_cdf((1 + level) / 2)
-    patterns = _patterns(document)
     sensors, each = list(document["sensors"]), list(rules.get("each") or [])
     own_rules = [_over(rules, each[index]) if index < len(each) else rules for index in range(len(sensors))]
     checks = _between("sensors", len(sensors), rules.get("sensors"))
@@ -86,7 +85,7 @@ def check_design(document: Mapping[str, Any], constraints: Any, space: Any = Non
         checks += _excluded(name, sensor, own, z) + _intervals(name, sensor, own)
         if bounds is not None:
             checks += _inside_space(name, sensor, bounds)
-    for pattern in patterns:
+    for pattern in _patterns(document):
         checks += _pattern(pattern, own_rules, bounds)
         # others fire what their part or file says, whose field may be round
         if document.get("layout") in ("chosen", "spinning"):
@@ -121,14 +120,13 @@ def _slack(bound: float) -> float:
     return ROUNDING * max(abs(bound), 1.0)
 
 
-def _between(name: str, value: float, rules: Any, highest: float | None = None) -> list[ConstraintCheck]:
-    """Checks of `min` on a value and of `max` on it or on `highest`, where they are given."""
-    checks, highest = [], value if highest is None else highest
-    low, high = _get(rules, "min"), _get(rules, "max")
+def _between(name: str, value: float, rules: Any) -> list[ConstraintCheck]:
+    """Checks of `min` and `max` on a value, where they are given."""
+    checks, low, high = [], _get(rules, "min"), _get(rules, "max")
     if low is not None:
         checks.append(ConstraintCheck(f"{name}.min", low, value, bool(value >= low - _slack(low))))
     if high is not None:
-        checks.append(ConstraintCheck(f"{name}.max", high, highest, bool(highest <= high + _slack(high))))
+        checks.append(ConstraintCheck(f"{name}.max", high, value, bool(value <= high + _slack(high))))
     return checks
 
 
@@ -242,12 +240,8 @@ def _outside(name: str, low: list[float], high: list[float], rules: Mapping[str,
     value = {"low_m": low, "high_m": high}
     return [
         ConstraintCheck(f"{name}.origin.exclude[{index}]", box, value, not _reaches_into(low, high, box))
-        for index, box in enumerate(_boxes(rules))
+        for index, box in enumerate(_get(rules, "origin", "exclude") or [])
     ]
-
-
-def _boxes(rules: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    return list(_get(rules, "origin", "exclude") or [])
 
 
 def _reaches_into(low: Sequence[float], high: Sequence[float], box: Mapping[str, Any]) -> bool:

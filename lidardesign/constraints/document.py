@@ -20,30 +20,30 @@ Entries of `each` apply to the first, second, ... sensor over the common keys.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Field,
-    model_validator,
-)
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from lidardesign.errors import UNSET_HINT, ConfigError
-from lidardesign.run.validation import apply_override, check_model, parse_override, parse_overrides
-from lidardesign.run.yaml import Document, KeyPath, leaves, load_yaml
+from lidardesign.run.validation import (
+    apply_override,
+    check_model,
+    parse_override,
+    parse_overrides,
+    placed_at,
+)
+from lidardesign.run.yaml import Document, KeyPath, leaves, load_yaml, merged
 from lidardesign.run_folder import Notes, log_note
+from lidardesign.sensors.bandwidth import Bandwidth
+from lidardesign.sensors.design_file import Distance, Vector
 from lidardesign.sensors.sensor import MOST_RAYS
 from lidardesign.space import FARTHEST_M, MOST_TURNS, SHORTEST_M
 from lidardesign.task import Task
 
-Coordinate = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M)]
-Vector = Annotated[list[Coordinate], Field(min_length=3, max_length=3)]
-Distance = Annotated[float, Field(ge=0, le=FARTHEST_M)]
 # Between these products of constraints are numbers, whatever is narrowed to them.
 Positive = Annotated[float, Field(ge=SHORTEST_M, le=FARTHEST_M)]
 Angle = Annotated[float, Field(ge=-360 * MOST_TURNS, le=360 * MOST_TURNS)]
@@ -184,6 +184,11 @@ class Budget(_Keys):
     bits_per_bin: Annotated[float, Field(ge=0.001, le=1e9)] = 40.0
     rate_hz: Annotated[float, Field(ge=0.001, le=1e12)] = 10.0
 
+    @property
+    def readout(self) -> Bandwidth:
+        """The read-out model."""
+        return Bandwidth(self.bin_ps, self.bits_per_bin, self.rate_hz)
+
 
 class MostOfPart(_Keys):
     """The largest number of a part in a design, as `{max: 1}`."""
@@ -299,11 +304,7 @@ class Constraints(SensorConstraints):
         """
         if values is not None and not isinstance(values, Mapping):
             raise ConfigError(f"found one {type(values).__name__}", where=where, allowed="a mapping, as `gate: {...}`")
-
-        def named(path: tuple[str | int, ...], *, key: bool = False) -> str:
-            return where
-
-        values, locate = dict(values or {}), locate or named
+        values, locate = dict(values or {}), locate or placed_at(where)
         for path, value in leaves(values):
             if value is None:
                 name = ".".join(map(str, path))
@@ -323,30 +324,15 @@ class Constraints(SensorConstraints):
         for index, entry in enumerate([*self.each, SensorConstraints()]):
             own = entry.model_dump(exclude_none=True)
             resolved = SensorConstraints.model_validate(merged(common, own))
-            keys = frozenset(_key_paths(own)) if index < len(self.each) else frozenset()
-            rules.append(SensorRules(**dict(resolved), index=index, own_keys=keys))
+            # the keys at every depth, joined by dots
+            paths = [list(map(str, path)) for path, _ in leaves(own)]
+            keys = {".".join(path[:depth]) for path in paths for depth in range(1, len(path) + 1)}
+            rules.append(SensorRules(**dict(resolved), index=index, own_keys=frozenset(keys)))
         return tuple(rules)
 
     def as_document(self) -> dict[str, Any]:
         """The plain values that were given, for the design file."""
         return self.model_dump(exclude_none=True, exclude_unset=True, exclude=None if self.survive else {"survive"})
-
-
-def merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """Plain values overridden by others, key by key at every depth."""
-    result = dict(base)
-    for key, value in over.items():
-        both = isinstance(value, Mapping) and isinstance(result.get(key), dict)
-        result[key] = merged(result[key], value) if both else value
-    return result
-
-
-def _key_paths(values: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
-    """The keys of plain values at every depth, joined by dots."""
-    for key, value in values.items():
-        yield prefix + key
-        if isinstance(value, Mapping):
-            yield from _key_paths(value, f"{prefix}{key}.")
 
 
 def split_settings(overrides: Sequence[str], task: Task) -> tuple[list[str], list[str]]:

@@ -11,29 +11,23 @@ from __future__ import annotations
 import bisect
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import numpy as np
 
 from lidardesign.constraints.document import MOST_ROLL_DEG, Constraints, SensorRules
 from lidardesign.constraints.origins import free_boxes, most_mounted, mounts_of, snap_place_to_space
 from lidardesign.errors import InfeasibleError
-from lidardesign.numerics import COARSE_SLACK, SLACK
+from lidardesign.numerics import SLACK
 from lidardesign.run.yaml import leaves
 from lidardesign.sensors.bandwidth import Bandwidth, split_budget
 from lidardesign.space import AZIMUTH, DIMENSIONS, ELEVATION, RANGE, DesignSpace
 
 # Bounds that differ by less come from the same number through degrees and radians [m or rad].
 AGREEMENT = SLACK
-# A cap of n bins is this share narrower, so that its width never rounds up to n + 1 bins.
-BIN_MARGIN = COARSE_SLACK
-MOST_REFITS = 12
 # Lengths beyond so many times the space, and smaller fields of view, are probably in another unit.
 DOUBTFUL_TIMES, DOUBTFUL_DEG = 10.0, 1.0
-
-Fitted = TypeVar("Fitted")
 
 
 @dataclass(frozen=True)
@@ -199,7 +193,7 @@ def _check_boresight(rules: SensorRules, space: DesignSpace, *, are_parts: bool)
         _refuse(f"a roll of at least {low:g} and at most {high:g} degrees", names)
     if not are_parts and (low > MOST_ROLL_DEG or high < -MOST_ROLL_DEG):
         _refuse("beyond 45 degrees a field is the same with its two angles exchanged", names)
-    if not {AZIMUTH, ELEVATION} <= set(space.free) and not low <= 0 <= high:
+    if not space.turns and not low <= 0 <= high:
         _refuse("the roll is 0 where the design space holds all rays in a plane", [*names, "space"])
     ends = [end for end in ("min", "max") if getattr(azimuth, end) is not None]
     if not ends or space.full_azimuth:
@@ -288,7 +282,6 @@ def _check_budget(constraints: Constraints, needed: Sequence[SensorRules], least
         _refuse(f"{given.value} rays for {least.value:g} sensors", [given.name, least.name or "sensors"])
     if budget.bandwidth_mbps is None:
         return
-    model = Bandwidth(budget.bin_ps, budget.bits_per_bin, budget.rate_hz)
     widths = [least_width(rules) for rules in needed]
     numbers = [_Bound(1, ""), least] + ([given] if given.value is not None else [])
     common, least_of_all = least_width(constraints.rules[-1]), min(width for width, _ in widths)
@@ -297,7 +290,7 @@ def _check_budget(constraints: Constraints, needed: Sequence[SensorRules], least
     narrowest += [common] if common[0] <= least_of_all else []
     # the fewest names first: one ray of any gate, then as many as are asked for, then as wide as is asked for
     for (width, names), rays in sorted(itertools.product(narrowest, numbers), key=lambda pair: len(pair[0][1])):
-        mbps = model.mbps_of_widths([width], int(rays.value))
+        mbps = budget.readout.mbps_of_widths([width], int(rays.value))
         if mbps > budget.bandwidth_mbps:
             text = f"{rays.value:g} rays need at least {mbps:g} Mbit/s, more than {budget.bandwidth_mbps:g} Mbit/s"
             _refuse(text, [rays.name, "budget.bandwidth_mbps", *names])
@@ -309,8 +302,7 @@ def most_rays(constraints: Constraints) -> int | None:
     if budget.bandwidth_mbps is None:
         return None
     narrowest = min(least_width(rules)[0] for rules in constraints.rules)
-    model = Bandwidth(budget.bin_ps, budget.bits_per_bin, budget.rate_hz)
-    return max(int(budget.bandwidth_mbps / model.mbps_of_widths([narrowest], 1)), 1)
+    return max(int(budget.bandwidth_mbps / budget.readout.mbps_of_widths([narrowest], 1)), 1)
 
 
 def least_width(rules: SensorRules) -> tuple[float, list[str]]:
@@ -347,9 +339,8 @@ class BandwidthBudget:
         budget = constraints.budget
         names = ["budget.rays"] if budget.rays is not None else ["--rays"] if rays is not None else []
         names += [name for rules in constraints.rules for name in least_width(rules)[1]]
-        model = Bandwidth(budget.bin_ps, budget.bits_per_bin, budget.rate_hz)
         wanted = budget.rays if rays is None else rays
-        return cls(model, budget.bandwidth_mbps, wanted, tuple(dict.fromkeys(names)))
+        return cls(budget.readout, budget.bandwidth_mbps, wanted, tuple(dict.fromkeys(names)))
 
     def mbps(self, widths_m: np.ndarray, weights: np.ndarray, rays: int) -> float:
         """Bandwidth of gates (K,) [m] whose rays are split by weights (K,)."""
@@ -369,51 +360,7 @@ class BandwidthBudget:
         return max(rays, len(widths_m))
 
 
-def fit_within_budget(
-    fitted: Fitted,
-    refit: Callable[[Fitted, float], Fitted],
-    shape: Callable[[Fitted], tuple[np.ndarray, np.ndarray]],
-    budget: BandwidthBudget,
-) -> tuple[Fitted, int | None]:
-    """A fit that keeps the bandwidth budget, and its number of rays.
-
-    Where the fit is too expensive its gates are narrowed to a common number of bins and it is refitted from
-    where it was, until the count of whole bins keeps the budget.
-
-    Arguments:
-        fitted: The fit without a budget.
-        refit: Continues a fit with gates no wider than a cap [m].
-        shape: Gate widths [m] and weights of a fit, shape (K,) each.
-        budget: Budget and bandwidth model.
-
-    Raises:
-        InfeasibleError: Even the narrowest admitted gates exceed the budget.
-    """
-    widths, weights = shape(fitted)
-    if budget.limit_mbps is None:
-        return fitted, budget.rays
-    rays = budget.rays if budget.rays is not None else budget.affordable_rays(widths, weights)
-    if budget.fits(widths, weights, rays):
-        return fitted, rays
-    bins = _affordable_bins(budget, widths, weights, rays)
-    for _ in range(MOST_REFITS):
-        fitted = refit(fitted, (1 - BIN_MARGIN) * max(bins, 1) * budget.model.bin_m)
-        widths, weights = shape(fitted)
-        if budget.fits(widths, weights, rays):
-            return fitted, rays
-        if bins <= 1:
-            break
-        bins = min(bins - 1, _affordable_bins(budget, widths, weights, rays))
-    needed = budget.mbps(widths, weights, rays)
-    raise InfeasibleError(
-        f"{rays} rays still need {needed:g} Mbit/s with the narrowest gates that the other constraints allow",
-        conflicts=["budget.bandwidth_mbps", *budget.names],
-        allowed=f"at most {budget.limit_mbps:g} Mbit/s",
-        hint="fewer rays, narrower gates, or more bandwidth",
-    )
-
-
-def _affordable_bins(budget: BandwidthBudget, widths: np.ndarray, weights: np.ndarray, rays: int) -> int:
+def affordable_bins(budget: BandwidthBudget, widths: np.ndarray, weights: np.ndarray, rays: int) -> int:
     """The largest common cap in bins that keeps the budget with the present weights, at least 1."""
     counts = split_budget(weights, rays, each=True)
     bins = budget.model.bins(widths)

@@ -23,8 +23,7 @@ from lidardesign.contract.law import (
     place_of,
     restore_random_states,
 )
-from lidardesign.errors import ConfigError, LidardesignError
-from lidardesign.registry import text_of
+from lidardesign.errors import ConfigError, LidardesignError, text_of
 from lidardesign.task import Task
 
 

@@ -18,8 +18,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
-from lidardesign.density.fields.distance import TableField
-from lidardesign.density.fields.importance import TableWeights
+from lidardesign.density.fields.distance import GridColumns, TableField
 from lidardesign.density.objective.quadrature import Quadrature
 from lidardesign.density.objective.surfaces import SceneTable
 from lidardesign.density.objective.target import Target
@@ -158,7 +157,7 @@ class DeviceTarget(Target):
 class _Table:
     """A table of distances, or of other values, on a device: shape (grid points, columns)."""
 
-    def __init__(self, source: TableField | TableWeights, device: torch.device) -> None:
+    def __init__(self, source: GridColumns, device: torch.device) -> None:
         grid = source.grid
         self._table = torch.as_tensor(source.table).to(device)
         self._low = torch.as_tensor(grid.low).to(device)
@@ -204,11 +203,6 @@ def on_device(target: Target, device: torch.device) -> Target:
     if not tables and not isinstance(visibility, NoVisibility):
         return target
     return DeviceTarget(**{part.name: getattr(target, part.name) for part in fields(target)}, device=device)
-
-
-def stays_on(target: Target, device: torch.device) -> bool:
-    """True where steps of a flow on a device evaluate the target on the same device."""
-    return device.type == "cpu" or isinstance(target, DeviceTarget)
 
 
 class _LogTarget(torch.autograd.Function):

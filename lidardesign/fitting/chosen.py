@@ -11,6 +11,7 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +22,7 @@ from lidardesign.fitting.request import FitRequest
 from lidardesign.mixture.bounds import INWARD, bounds_of
 from lidardesign.mixture.fit import FittedSensors
 from lidardesign.numerics import COARSE_SLACK
-from lidardesign.rays.gates import GateLimits
+from lidardesign.rays.gates import admitted_choices
 from lidardesign.rays.information import FEW_SCENES, MOST_SELECTED, features_of
 from lidardesign.rays.pool import CandidatePool, cached_information
 from lidardesign.rays.proposals import (
@@ -29,6 +30,7 @@ from lidardesign.rays.proposals import (
     LEAST_CANDIDATES_OF_REGIONS,
     Proposals,
     first_candidates,
+    owners,
     rays_of_points,
 )
 from lidardesign.rays.selection import Selected, Selection, inform_enough, select
@@ -37,7 +39,7 @@ from lidardesign.run.clock import phase
 from lidardesign.samples import Samples
 from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.adaptive import AdaptivePatterns
-from lidardesign.sensors.bandwidth import Bandwidth, split_budget
+from lidardesign.sensors.bandwidth import split_budget
 from lidardesign.sensors.pattern import Pattern
 from lidardesign.sensors.sensor import Sensor, interval_factor, tangent_directions
 from lidardesign.space import (
@@ -66,7 +68,6 @@ class ChosenRays(NamedTuple):
         sensors: With fields of view and gates no larger than their rays need.
         patterns: One for each number of rays, ascending.
         certificates: Of the numbers of rays that were certified.
-        idle: Indices of sensors that fire no ray at the largest number.
         silent: The share of scenes held back about which the largest number of rays has no information.
         shared: The share of what sensors see that several of them see; 1 where none may fail.
         adaptive: Patterns that follow what they see; None where they are not asked for, or bring nothing.
@@ -75,7 +76,6 @@ class ChosenRays(NamedTuple):
     sensors: tuple[Sensor, ...]
     patterns: tuple[Pattern, ...]
     certificates: tuple[dict[str, object], ...]
-    idle: tuple[int, ...]
     silent: float
     shared: float = 1.0
     adaptive: AdaptivePatterns | None = None
@@ -128,12 +128,20 @@ def choose_rays(
     picked = None if pool is None else _picked(pool, proposals, conditions, wanted, least)
     lists = picked[0] if picked else _drawn(proposals, conditions, wanted, least, training.seed)
     ends = np.cumsum([0, *map(len, lists)]).tolist()
-    limits = GateLimits(placed, constraints.rules, level, samples.space, training.margin_m, is_shared=gates != "ray")
+    admitted = partial(
+        admitted_choices,
+        sensors=placed,
+        rules=constraints.rules,
+        level=level,
+        space=samples.space,
+        margin_m=training.margin_m,
+        is_shared=gates != "ray",
+    )
     selection = Selection(
         rays=Rays.joined(lists),
         visits=[slice(*pair) for pair in itertools.pairwise(ends)],
-        gates=limits.choices,
-        bandwidth=Bandwidth(budget.bin_ps, budget.bits_per_bin, budget.rate_hz),
+        gates=admitted,
+        bandwidth=budget.readout,
         limit_mbps=np.inf if budget.bandwidth_mbps is None else budget.bandwidth_mbps,
         shares=weights if len(lists) > 1 else None,
         is_shared=gates != "ray",
@@ -164,7 +172,6 @@ def choose_rays(
         tuple(replace(sensor, weight=float(share)) for sensor, share in zip(sensors, shares, strict=True)),
         patterns,
         tuple(one.certificate for one in selected if one.certificate is not None),
-        tuple(np.flatnonzero(per_sensor == 0).tolist()),
         selected[-1].silent,
         proposals.share_of_several(conditions[len(conditions) // 2]) if may_fail else 1.0,
         adaptive,
@@ -217,7 +224,8 @@ def _picked(
     number, known, lists = np.full(len(pool.points), -1), 0, []
     for visit, at in zip(pool.visits, conditions, strict=True):
         sensors, points = proposals.sensors_at(at), pool.points[visit]
-        owner, fired = proposals.owners(sensors, points, proposals.samples.space.at(at))
+        space = proposals.samples.space.at(at)
+        owner, fired = owners(sensors, proposals.rules, proposals.level, points, space, by_turns=proposals.by_turns)
         inside = np.flatnonzero(owner >= 0)
         chosen = inside[first_candidates(owner[inside], count, least)]
         if len(chosen) < count or (np.bincount(owner[chosen], minlength=len(least)) < least).any():
@@ -264,7 +272,7 @@ def smallest_field(sensor: Sensor, looking: np.ndarray, rules: SensorRules, spac
     widest, fields, bounds = np.array(sensor.field_of_view_rad), rules.field_of_view, rules.boresight
     least = np.radians([fields.horizontal_deg.min or 0.0, fields.vertical_deg.min or 0.0])
     ends = (bounds.azimuth_deg.min, bounds.azimuth_deg.max, bounds.elevation_deg.min, bounds.elevation_deg.max)
-    may_turn = all(end is None for end in ends) and {AZIMUTH, ELEVATION} <= set(space.free)
+    may_turn = all(end is None for end in ends) and space.turns
     tried, best, smallest = sensor, sensor, math.inf
     for _ in range(CENTRING_ROUNDS if may_turn else 1):
         tangent = tried.tangent_of(looking)

@@ -23,7 +23,7 @@ import numpy as np
 
 from lidardesign.config import FILE_NAME, with_task_settings
 from lidardesign.constraints.check import ConstraintCheck, check_design
-from lidardesign.constraints.document import Constraints, merged
+from lidardesign.constraints.document import Constraints
 from lidardesign.constraints.feasibility import check_feasible
 from lidardesign.constraints.origins import placement_notes
 from lidardesign.errors import BackgroundNote, DataError, InfeasibleError
@@ -38,7 +38,7 @@ from lidardesign.rays.training import CHOICE, TrainingScenes
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.run.manifest import read_manifest, versions
-from lidardesign.run.yaml import dump_yaml, parse_yaml
+from lidardesign.run.yaml import dump_yaml, merged, parse_yaml
 from lidardesign.run_folder import Notes, RunFolder, ignore, log_note
 from lidardesign.samples import Samples, load_samples
 from lidardesign.sensors.design import DesignSpec
@@ -108,7 +108,7 @@ def fit_design(
         "seed": request.seed,
         "versions": versions(),
     }
-    weighting = {KEY: request.weighting.as_document()} if request.weighting.settings else {}
+    weighting = {KEY: {"set": list(request.weighting.settings)}} if request.weighting.settings else {}
     world = {WORLD: request.world} if request.world else {}
     with plugin_guard(run.task.name):
         mount = mount_of(run.task, run.config.task)
@@ -386,8 +386,15 @@ class Fitter:
                 )
         elif fitted.rays is not None:
             design = replace(design, constraints=merged(design.constraints, {"budget": {"rays": fitted.rays}}))
-        result = FitResult.of_fit(design, fitted, self.samples, time.perf_counter() - started)
-        return replace(result, notes=(*notes, *result.notes))
+        return FitResult(
+            design,
+            fitted.log_likelihood.value,
+            fitted.admissible_mass,
+            fitted.ess,
+            time.perf_counter() - started,
+            notes=(*notes, *fitted.notes),
+            error_estimates=fitted.estimates(self.samples),
+        )
 
     def _if_better(self, design: DesignSpec, notes: list[str]) -> DesignSpec:
         """The design with its adaptive patterns where they score better on training scenes held back, else without.
@@ -444,8 +451,7 @@ class Fitter:
     def _parts(self, request: FitRequest, notes: Notes) -> FitResult:
         from lidardesign.fitting.part_design import choose_parts
 
-        informs = partial(checked_information, request.run.task)
-        return choose_parts(self.samples, request, self.training, informs, notes, self.progress)
+        return choose_parts(self.samples, request, self.training, notes, self.progress)
 
     def _rings(self) -> FitResult:
         from lidardesign.fitting.spinning import CHANNELS, choose_rings

@@ -120,7 +120,7 @@ def check_layout(layout: LayoutName, constraints: Constraints, run: RunFolder, o
         )
     place = f"the layout {layout}" if constraints.parts is None else "a design of real parts"
     faults = {
-        (f"{options.channels} channels in the layout {layout}", "--channels", "--layout spinning"): (
+        (f"{options.channels} channels in {place}", "--channels", "--layout spinning, without parts"): (
             options.channels is not None and layout != "spinning"
         ),
         (f"a gate per ray in the layout {layout}", "--gates", "--layout chosen"): (
@@ -133,9 +133,12 @@ def check_layout(layout: LayoutName, constraints: Constraints, run: RunFolder, o
             layout == "spinning" and (bool(options.at) or bool(options.weights))
         ),
         (f"patterns that follow what they see in {place}", "--adaptive", "--layout chosen, without parts"): (
-            (options.adaptive or 1) > 1 and (place != "the layout chosen" or bool(constraints.survive))
+            (options.adaptive or 1) > 1 and place != "the layout chosen"
         ),
-        (f"{options.sensors!r} sensors that spin", "--sensors", "a whole number"): (
+        ("patterns that follow what they see, of sensors that survive", "--adaptive", "one of the two"): (
+            (options.adaptive or 1) > 1 and bool(constraints.survive)
+        ),
+        (f"{options.sensors!r} sensors in the layout spinning", "--sensors", "a whole number"): (
             layout == "spinning" and isinstance(options.sensors, str)
         ),
     }

@@ -47,7 +47,7 @@ from lidardesign.rays.selection import are_enough
 from lidardesign.rays.training import CHOICE, HELD_BACK, InformedScene, TrainingScenes
 from lidardesign.run.clock import phase
 from lidardesign.samples import Samples
-from lidardesign.scenes.rays import Rays, Returns
+from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Scene
 from lidardesign.sensors.bandwidth import split_budget
 from lidardesign.sensors.design import DesignSpec
@@ -57,7 +57,7 @@ from lidardesign.sensors.sensor import DEFAULT_LEVEL, Sensor, interval_factor
 from lidardesign.simulate.calibration import reach_notes, with_part_light
 from lidardesign.simulate.detector.physics import IDEAL, Detector, check_windows
 from lidardesign.space import angles, observed_point
-from lidardesign.task import Information, Metric, random_generator
+from lidardesign.task import Metric, random_generator
 
 MOST_JUDGED = 8  # sets of a number of parts, by the task's score; twice as many under a detector
 JUDGED_FRAMES = 2000  # that the last sets are scored in at most, or twice as many scenes as at first
@@ -85,7 +85,6 @@ def choose_parts(
     samples: Samples,
     request: FitRequest,
     training: TrainingScenes,
-    informs: Callable[[Scene, Sequence[Returns]], Information],
     notes: Callable[[str], None],
     progress: Callable[[str], None],
 ) -> FitResult:
@@ -95,7 +94,6 @@ def choose_parts(
         samples: Samples of the density.
         request: What is asked for.
         training: Training scenes, in the world that is asked for.
-        informs: The task's information of a scene's returns.
         notes: Called with every note.
         progress: Called with every step.
 
@@ -129,6 +127,7 @@ def choose_parts(
             hint="loosen one of the constraints named, or fire fewer rays",
         )
     bundle = PartBundle(placed, most, training.first(HELD_BACK)[0].frames, detector)
+    informs = partial(information.checked_information, training.run.task)
     inform = partial(parts_inform, bundle, informs=informs, count=count, seed=request.seed)
     # under a detector information ranks sets little: it proposes more of them, on fewer scenes, and the score decides
     most_scenes = information.MOST_SCENES if planner is None else 2 * information.FEW_SCENES
@@ -173,7 +172,8 @@ def choose_parts(
         unit=trained[0].unit,
     )
     design = replace(winner.design, certificates=(certificate,))
-    return replace(FitResult.of_choice(design, samples, perf_counter() - started), numbers=tuple(rows))
+    seconds = perf_counter() - started
+    return FitResult(design, None, None, samples.effective_sample_size, seconds, numbers=tuple(rows))
 
 
 def _sets_by_number(
@@ -523,15 +523,18 @@ def _design(name: str, constraints: Constraints, placed: Sequence[PlacedPart], r
         )
     counts = split_budget(np.array(patterns), total).tolist()
     tables = [part_rays(one.part, one.pose, count) for one, count in zip(placed, counts, strict=True)]
-    sensors = []
-    for index, (one, count) in enumerate(zip(placed, counts, strict=True)):
-        start, end = one.shape.gate_m
-        sensor = part_sensor(one.part, one.pose, name=f"s{index}", weight=count / total)
-        sensors.append(replace(sensor, gate_m=(start, end)))
-    gates = [np.tile(one.shape.gate_m, (count, 1)) for one, count in zip(placed, counts, strict=True)]
+    sensors = [
+        replace(part_sensor(one.part, one.pose, name=f"s{index}", weight=count / total), gate_m=one.shape.gate_m)
+        for index, (one, count) in enumerate(zip(placed, counts, strict=True))
+    ]
     fired = [
-        replace(rays, gate_m=gate_m, sensor=np.full(len(rays), index), time_s=np.zeros(len(rays)))
-        for index, (rays, gate_m) in enumerate(zip(tables, gates, strict=True))
+        replace(
+            rays,
+            gate_m=np.tile(one.shape.gate_m, (len(rays), 1)),
+            sensor=np.full(len(rays), index),
+            time_s=np.zeros(len(rays)),
+        )
+        for index, (one, rays) in enumerate(zip(placed, tables, strict=True))
     ]
     return DesignSpec(
         name=name,

@@ -178,18 +178,13 @@ def _filled(coverage: Coverage, limits: SetLimits, chosen: Sequence[int]) -> tup
 
 def _improved(coverage: Coverage, limits: SetLimits) -> tuple[int, ...]:
     """The greedy set, members exchanged until no exchange gains."""
-    best = _filled(coverage, limits, ())
-    value, is_better = value_of(coverage, best), True
-    while is_better:
-        is_better = False
-        for leaving in range(1, MOST_LEAVING + 1):
-            for rest in itertools.combinations(best, max(len(best) - leaving, 0)):
-                tried = _filled(coverage, limits, rest)
-                if (found := value_of(coverage, tried)) > value * (1 + SLACK):
-                    best, value, is_better = tried, found, True
-                    break
-            if is_better:
-                break
+    better = _filled(coverage, limits, ())
+    while better is not None:
+        best, least = better, value_of(coverage, better) * (1 + SLACK)
+        sizes = (max(len(best) - leaving, 0) for leaving in range(1, MOST_LEAVING + 1))
+        rests = itertools.chain.from_iterable(itertools.combinations(best, size) for size in sizes)
+        tried = (_filled(coverage, limits, rest) for rest in rests)
+        better = next((one for one in tried if value_of(coverage, one) > least), None)
     return best
 
 

@@ -39,7 +39,7 @@ from lidardesign.scenes.rays import Rays, Returns
 from lidardesign.scenes.scene import Scene
 from lidardesign.sensors.pattern import even_subset
 from lidardesign.sensors.sensor import boresight_frame, boresight_of
-from lidardesign.simulate.detector.physics import Detector, Physics
+from lidardesign.simulate.detector.physics import IDEAL, Detector, Physics
 from lidardesign.simulate.returns import build_casters, simulate_many
 from lidardesign.space import RANGE, DesignSpace, angles
 from lidardesign.task import Information, random_generator
@@ -168,17 +168,15 @@ class PartBundle:
         placed: The parts.
         most_rays: The largest number of rays of each, an even subset of its pattern.
         frames: Number of casts in a scene.
-        detector: The detector; beams are lines where it has no wide ones, or there is none.
+        detector: The detector; beams are lines where it has no wide ones.
 
     `rays` are to be cast; those of part i are `members[first[i]:first[i + 1]]`, some more than once. Of them a part
     has `usual_rays` in the middle. Beams are the same between `ends`, each with its `physics`.
     """
 
-    def __init__(
-        self, placed: Sequence[PlacedPart], most_rays: int, frames: int, detector: Detector | None = None
-    ) -> None:
+    def __init__(self, placed: Sequence[PlacedPart], most_rays: int, frames: int, detector: Detector = IDEAL) -> None:
         self.placed, self.most_rays = placed, most_rays
-        self.is_wide = detector is not None and detector.footprint_rays > 1 and detector.divergence_rad > 0
+        self.is_wide = detector.footprint_rays > 1 and detector.divergence_rad > 0
         self._beams = sorted({self._beam(one) for one in placed})
         self.most_pattern = min(most_rays, max(MOST_MEMBERS // len(placed), 1))
         self._patterns: dict[str, np.ndarray] = {}
@@ -200,9 +198,13 @@ class PartBundle:
             origin[own] = placed[part].pose.origin_m
             looking[own] = self._looking(placed[part])[index[own] - self.first[part]]
         gate_m = (min(one.shape.gate_m[0] for one in placed), max(one.shape.gate_m[1] for one in placed))
-        count, widths = len(cast), [(beam, detector) for beam in self._beams]
-        self.ends = np.searchsorted(cast, MOST_PER_BEAM * np.arange(len(widths) + 1))
-        self.physics = [_wide_beams(*one) if one[0] else None for one in widths]
+        count, wide = len(cast), replace(detector, footprint_rays=BEAM_RAYS, bins=None)
+        self.ends = np.searchsorted(cast, MOST_PER_BEAM * np.arange(len(self._beams) + 1))
+        # of beams of an angle a detector merges the light into returns
+        self.physics = [
+            Physics(replace(wide, divergence_rad=beam), frozenset({"footprint"})) if beam else None
+            for beam in self._beams
+        ]
         self.rays = Rays(origin, looking, np.tile(gate_m, (count, 1)), np.zeros(count, dtype=np.intp), np.zeros(count))
 
     def returns(self, scene: Scene) -> list[Returns]:
@@ -239,12 +241,6 @@ class PartBundle:
             cell, cells = cells_of(self._looking(one), max(size_rad, beam / CELLS_PER_BEAM))
             keys.append(self._beams.index(beam) * MOST_PER_BEAM + one.place * cells + cell)
         return keys
-
-
-def _wide_beams(beam_rad: float, detector: Detector) -> Physics:
-    """Beams of an angle, whose light a detector merges into returns."""
-    wide = replace(detector, divergence_rad=beam_rad, footprint_rays=BEAM_RAYS, bins=None)
-    return Physics(wide, frozenset({"footprint"}))
 
 
 @phase("what returns tell")

@@ -25,11 +25,9 @@ from lidardesign.estimates import Estimate, as_documents
 from lidardesign.fitting.options import BEST, LEAST, FitOptions, check_goal, check_layout, refuse_first
 from lidardesign.formats.designs import reach_of, read_design
 from lidardesign.formats.rig import moved_notes, rig_constraints, rig_notes
-from lidardesign.mixture.fit import FittedSensors
 from lidardesign.rays.information import informs_rays
 from lidardesign.run.manifest import read_manifest
 from lidardesign.run_folder import Notes, RunFolder, log_note, settings_texts
-from lidardesign.samples import Samples
 from lidardesign.sensors.design import FITTED_LAYOUTS, DesignSpec, Gates, LayoutName
 from lidardesign.sensors.pattern import TRAVELLED
 from lidardesign.space import DIMENSIONS, DesignSpace
@@ -146,7 +144,8 @@ class FitRequest:
         space = run.config.space.at(at)
         if layout != "spinning" and rules.parts is None:
             _check_conditions(rules, space)
-        weighting = _weighting(settings_texts(options.weights), base)
+        weights = settings_texts(options.weights)
+        weighting = Weighting(weights) if weights or base is None else Weighting.of(base)
         if weighting.settings:
             with_task_settings(run.task, run.config, weighting.settings, option=weighting.origin)
         detector, settings = _world(options, base)
@@ -237,17 +236,11 @@ class Weighting:
         document, where = design.provenance.get(KEY), f"{KEY} of design {design.name}"
         if document is None:
             return cls()
-        if not isinstance(document, Mapping) or set(document) != {"set"}:
-            found = f"keys {', '.join(map(str, document))}" if isinstance(document, Mapping) else repr(document)
-            raise ConfigError(f"holds {found}", where=where, allowed="the key set alone", hint=FIT_AGAIN)
-        settings = document["set"]
+        settings = document["set"] if isinstance(document, Mapping) and set(document) == {"set"} else None
         if not isinstance(settings, list | tuple) or not all(isinstance(text, str) for text in settings):
-            raise ConfigError(f"set is {settings!r}", where=where, allowed="a list of KEY=VALUE", hint=FIT_AGAIN)
+            allowed = "the key set alone, a list of KEY=VALUE"
+            raise ConfigError(f"holds {document!r}", where=where, allowed=allowed, hint=FIT_AGAIN)
         return cls(tuple(settings), f"{where}: set")
-
-    def as_document(self) -> dict[str, Any]:
-        """Plain values, as they stand in the provenance of a design."""
-        return {"set": list(self.settings)}
 
 
 def _layout(constraints: Constraints, base: DesignSpec | None, run: RunFolder, options: FitOptions) -> LayoutName:
@@ -408,11 +401,6 @@ def _level(asked: float | None, base: DesignSpec | None, run: RunFolder, layout:
     return CHOSEN_LEVEL if layout == "chosen" else run.task.defaults.level
 
 
-def _weighting(settings: tuple[str, ...], base: DesignSpec | None) -> Weighting:
-    """The weighting of the samples: by the user's settings, else as for the design."""
-    return Weighting(settings) if settings or base is None else Weighting.of(base)
-
-
 def _world(options: FitOptions, base: DesignSpec | None) -> tuple[str | None, tuple[str, ...]]:
     """The user's detector and settings of scenes, each else as for the design.
 
@@ -434,8 +422,8 @@ class FitResult:
     Arguments:
         design: The design.
         log_likelihood: Weighted mean log density of the samples [nats]; None where it was chosen on scenes alone.
-        admissible_mass: The share of the density inside the constraints; None with fixed origins.
-        ess: Effective share of the samples that were admitted, 0 to 1.
+        admissible_mass: The share of the density inside the constraints; None with fixed origins, or likewise.
+        ess: Effective share of the samples that were admitted, or of all where it was chosen on scenes alone, 0 to 1.
         seconds: Wall time [s].
         constraints: The independent checks.
         notes: Lines on sensors.
@@ -454,18 +442,6 @@ class FitResult:
     numbers: tuple[Mapping[str, Any], ...] = ()
     error_estimates: Mapping[str, Estimate] = field(default_factory=dict)
     goal: Mapping[str, Any] | None = None
-
-    @classmethod
-    def of_fit(cls, design: DesignSpec, fitted: FittedSensors, samples: Samples, seconds: float) -> FitResult:
-        """A design whose sensors were fitted to samples."""
-        value, estimates = fitted.log_likelihood.value, fitted.estimates(samples)
-        mass = fitted.admissible_mass
-        return cls(design, value, mass, fitted.ess, seconds, notes=fitted.notes, error_estimates=estimates)
-
-    @classmethod
-    def of_choice(cls, design: DesignSpec, samples: Samples, seconds: float) -> FitResult:
-        """A design that was chosen on scenes instead of being fitted to samples."""
-        return cls(design, None, None, samples.effective_sample_size, seconds)
 
     @property
     def satisfied(self) -> bool:

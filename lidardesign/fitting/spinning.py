@@ -163,10 +163,18 @@ def choose_rings(
     reached = np.abs(candidates.elevation_rad[chosen % elevations])
     design = DesignSpec(
         name=name,
+        # upright, looking along +x over a full turn, as a part does (see `part_sensor`)
         sensors=tuple(
-            replace(
-                _spinning(candidates, f"s{number}", candidates.places_m[place], reached[sensor == number].max()),
+            Sensor(
+                name=f"s{number}",
                 weight=1 / count,
+                origin_m=candidates.places_m[place],
+                azimuth_rad=0.0,
+                elevation_rad=0.0,
+                roll_rad=0.0,
+                # as far up as down: so its own upright axis is that of its rings
+                field_of_view_rad=(FULL_TURN, 2 * float(reached[sensor == number].max())),
+                gate_m=candidates.range_m,
             )
             for number, place in enumerate(places)
         ),
@@ -176,7 +184,7 @@ def choose_rings(
         certificates=(certificate,),
         provenance={"channels": channels},
     )
-    return FitResult.of_choice(design, samples, perf_counter() - started)
+    return FitResult(design, None, None, samples.effective_sample_size, perf_counter() - started)
 
 
 def ring_grid(space: DesignSpace, rays: int | None, count: int, channels: int) -> tuple[np.ndarray, int]:
@@ -255,21 +263,6 @@ def chosen_rings(coverage: Coverage, place: np.ndarray, count: int, channels: in
     best = choose(coverage, max(sets, key=gained) if len(sets) > 1 else sets[0])
     # all rings of all places together lose no more than those of the best places
     bounded = sets if len(sets) <= MOST_BOUNDED else [RayCounts.of_one(len(place), count * channels)]
-    gain = max(certify(coverage, counts, best).bound for counts in bounded)
+    gain = max(certify(coverage, counts, best)[1] for counts in bounded)
     loss = coverage.complete - (best.worth - best.harm)
     return best, loss, float(np.clip(coverage.complete - gain, 0.0, loss))
-
-
-def _spinning(rings: RingCandidates, name: str, place_m: np.ndarray, highest_rad: float) -> Sensor:
-    """A sensor that stands upright and looks along +x; its field is a full turn, as a part's (see `part_sensor`)."""
-    return Sensor(
-        name=name,
-        weight=1.0,
-        origin_m=place_m,
-        azimuth_rad=0.0,
-        elevation_rad=0.0,
-        roll_rad=0.0,
-        # as far up as down: so its own upright axis is that of its rings
-        field_of_view_rad=(FULL_TURN, 2 * float(highest_rad)),
-        gate_m=rings.range_m,
-    )

@@ -14,13 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from lidardesign.constraints.document import Constraints, merged
+from lidardesign.constraints.document import Constraints
 from lidardesign.errors import BackgroundNote, InfeasibleError
 from lidardesign.estimates import Interval, mean_interval
 from lidardesign.fitting.request import FitRequest
 from lidardesign.rays.information import FEW_SCENES, MOST_SCENES
 from lidardesign.rays.selection import SHARE_PER_BANDWIDTH
 from lidardesign.rays.training import HELD_BACK, TrainingScenes
+from lidardesign.run.yaml import merged
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Scene, group_numbers
 from lidardesign.scoring.scene_scores import score_lists, without_each
@@ -280,8 +281,7 @@ class GoalSearch:
 
     def __init__(self, request: FitRequest, fit: Callable[[FitRequest], DesignSpec], scenes: HeldBackScenes) -> None:
         self.request, self.metric, self.scenes, self._fit = request, request.run.metric, scenes, fit
-        budget = request.constraints.budget
-        self._model = Bandwidth(budget.bin_ps, budget.bits_per_bin, budget.rate_hz)
+        self._model = request.constraints.budget.readout
         self.tried: list[GoalTrial] = []
         self._refused: InfeasibleError | None = None
 
@@ -363,8 +363,8 @@ class GoalSearch:
 
     def _with_rays(self, rays: int) -> FitRequest:
         """The request with a number of rays, whatever number its constraints name."""
-        bound = {} if self.request.constraints.budget.rays is None else {"rays": rays}
-        return _with_budget(replace(self.request, rays=rays), bound)
+        request = replace(self.request, rays=rays)
+        return request if request.constraints.budget.rays is None else _with_budget(request, {"rays": rays})
 
     def _least_bandwidth(self, rays: int, limit: float) -> float:
         """The least bandwidth below a limit in which so many rays keep the goal; the limit where there is none."""
@@ -429,5 +429,5 @@ def rounded_up(mbps: float) -> float:
 
 
 def _with_budget(request: FitRequest, budget: dict[str, float]) -> FitRequest:
-    document = merged(request.constraints.as_document(), {"budget": budget}) if budget else None
-    return request if document is None else replace(request, constraints=Constraints.from_mapping(document))
+    document = merged(request.constraints.as_document(), {"budget": budget})
+    return replace(request, constraints=Constraints.from_mapping(document))

@@ -23,19 +23,17 @@ shortens them. The result is deterministic.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.formats.ray_lists import LOST
+from lidardesign.formats.ray_lists import LOST, row_of_numbers
 from lidardesign.numerics import COARSE_SLACK, EPSILON, ROUNDING, SLACK
 from lidardesign.run.arrays import csv_rows
 from lidardesign.run.files import write_atomic
 from lidardesign.run.inputs import RAY_TABLE, read_head
-from lidardesign.run.yaml import plain_number
 from lidardesign.scenes.rays import Rays, fire_times
 from lidardesign.scenes.scene import SPEED_OF_LIGHT_M_S
 from lidardesign.sensors.bandwidth import Bandwidth
@@ -56,7 +54,6 @@ COLUMNS = (
     "step", "position", "origin_x_m", "origin_y_m", "origin_z_m", "boresight_azimuth_deg", "boresight_elevation_deg",
     "x_deg", "y_deg", "gate_start_ps", "gate_width_ps", "sensor", "ray",
 )  # fmt: skip
-LONGEST_SHOWN = 200  # characters of a row in a message
 # Byte order mark that spreadsheets put in front of UTF-8.
 BOM = b"\xef\xbb\xbf"
 # Angles at the limit come out of sines and cosines a few units in the last place off.
@@ -302,18 +299,13 @@ def _columns(path: Path) -> dict[str, np.ndarray]:
 
 def _numbers(row: list[str], where: str) -> list[float]:
     """Checked values of a row: finite, within limits, and whole and not negative in the columns `WHOLE`."""
-    try:
-        found = [plain_number(cell) for cell in row]
-    except ValueError as error:
-        raise DataError(str(error)[:LONGEST_SHOWN], where=where, allowed="numbers") from error
-    if len(found) != len(COLUMNS) or not all(map(math.isfinite, found)):
-        raise DataError(f"holds {str(row)[:LONGEST_SHOWN]}", where=where, allowed=f"{len(COLUMNS)} finite numbers")
-    for name, value in zip(COLUMNS, found, strict=True):
-        if name in WHOLE and (value < 0 or value != int(value) or value > MOST_WHOLE):
+    found = row_of_numbers(where, row, COLUMNS, WHOLE)
+    for name, value in found.items():
+        if name in WHOLE and (value != int(value) or value > MOST_WHOLE):
             raise DataError(f"{name} is {value:g}", where=where, allowed="whole numbers, 0 or more")
         if name in ("x_deg", "y_deg") and abs(value) > LIMIT_DEG + ROUNDING_DEG:
             raise DataError(f"{name} is {value:g}", where=where, allowed=f"+-{LIMIT_DEG:g} degrees")
-    return found
+    return list(found.values())
 
 
 def scan_angles_deg(frame: np.ndarray, directions: np.ndarray) -> np.ndarray:

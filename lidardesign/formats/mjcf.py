@@ -46,18 +46,6 @@ MOST_COPIES = 1000
 MOST_KEPT = 120_000
 
 
-def stripped_model(path: Path) -> ElementTree.Element:
-    """The model of a file reduced to the elements `KEPT`, with includes from its own folder.
-
-    Raises:
-        DataError: A file is not XML or outside the model's folder, or the model has unsupported or too many elements.
-    """
-    root = read_xml(path, ALLOWED)
-    model = ElementTree.Element("mujoco", {"model": "rig"})
-    _Copier([path.resolve()]).copy_children(root, model, path, depth=1)
-    return model
-
-
 @dataclass
 class _Copier:
     """Copies the kept elements of a model and of its includes.
@@ -171,12 +159,15 @@ class _Ray:
 
 
 def read_mjcf(path: Path) -> Rig:
-    """Read the rangefinders of a model as a rig.
+    """Read the rangefinders of a model, with includes from its own folder, as a rig.
 
     Raises:
-        DataError: The file is no model, MuJoCo refuses it, or it has no rangefinder.
+        DataError: A file is no model or outside the model's folder, the model has unsupported or too many elements,
+            MuJoCo refuses it, or it has no rangefinder.
     """
-    rays = _rays(stripped_model(path), path)
+    model = ElementTree.Element("mujoco", {"model": "rig"})
+    _Copier([path.resolve()]).copy_children(read_xml(path, ALLOWED), model, path, depth=1)
+    rays = _rays(model, path)
     if not rays:
         raise DataError(
             "has no rangefinder", where=str(path), allowed="<sensor> with <rangefinder site=...>, one per ray"

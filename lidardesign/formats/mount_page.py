@@ -132,10 +132,14 @@ def write_mounts(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     parent = WORLD if design.mount is None else design.mount
     frame = "world" if design.mount is None else f"body {design.mount}"
     rows = [one.row(frame) for one in mounted]
+    # a link per sensor, fixed to the link that it is mounted on
+    poses = [(one.name, one.sensor.origin_m, one.roll_pitch_yaw_rad) for one in mounted]
+    links = [part for pose in poses for part in fixed_link(*pose, parent=parent)]
+    robot = element("robot", {"name": identifier(design.name)}, [element("link", {"name": parent}), *links])
     files = {
         "mounts.html": _page(design, mounted, frame, parent).encode(),
         "mounts.csv": csv_table([rows[0], *(row.values() for row in rows)]).encode(),
-        "mounts.urdf": document(_urdf(design, mounted, parent)),
+        "mounts.urdf": document(robot),
         "static_transforms.sh": "".join(f"{line} &\n" for line in _transforms(mounted, parent)).encode() + b"wait\n",
     }
     notes = write_folder(path, files)
@@ -153,16 +157,6 @@ def write_mounts(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
             f"the part files of {', '.join(missing)} are not available: poses are those of the middles of their fields"
         )
     return [*notes, "sensors only: rays are lost; --format csv lists them"]
-
-
-def _urdf(design: DesignSpec, mounted: Sequence[MountedPart], parent: str) -> Any:
-    """A link per sensor, fixed to the link that it is mounted on."""
-    links = [
-        part
-        for one in mounted
-        for part in fixed_link(one.name, one.sensor.origin_m, one.roll_pitch_yaw_rad, parent=parent)
-    ]
-    return element("robot", {"name": identifier(design.name)}, [element("link", {"name": parent}), *links])
 
 
 def _transforms(mounted: Sequence[MountedPart], parent: str) -> list[str]:

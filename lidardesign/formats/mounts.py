@@ -20,15 +20,10 @@ from lidardesign.errors import DataError
 from lidardesign.formats.names import distinct, identifier
 from lidardesign.numerics import COARSE_SLACK, SLACK
 from lidardesign.scenes.rays import DEFAULT_RATE_HZ, Rays
+from lidardesign.sensors.compare import angles_between
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.sensor import Sensor
 from lidardesign.space import angles, direction
-
-
-def angles_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Angles between unit vectors (N, 3) [rad], exact for the smallest too: 2 arcsin(|a - b| / 2), shape (N,)."""
-    return 2 * np.arcsin(np.minimum(np.linalg.norm(first - second, axis=1) / 2, 1.0))
-
 
 # Origins and gates closer than this are the same.
 SAME_M = SLACK

@@ -360,7 +360,9 @@ def _rows(path: Path) -> tuple[list[tuple[dict[str, float], str]], list[str]]:
         lines = lines[1:]
     if not lines:
         raise DataError("has a header but no sensor", where=str(path))
-    rows = [(_numbers(f"{path}:{number}", cells, names), f"{path}:{number}") for number, cells in lines]
+    rows = [
+        (row_of_numbers(f"{path}:{number}", cells, names, NOT_NEGATIVE), f"{path}:{number}") for number, cells in lines
+    ]
     notes: list[str] = []
     if QUERY_COLUMN in names:
         positions = sorted({row[QUERY_COLUMN] for row, _ in rows})
@@ -374,12 +376,19 @@ def _rows(path: Path) -> tuple[list[tuple[dict[str, float], str]], list[str]]:
     return rows, notes
 
 
-def _numbers(where: str, cells: list[str], names: tuple[str, ...]) -> dict[str, float]:
+def row_of_numbers(
+    where: str, cells: list[str], names: tuple[str, ...], not_negative: tuple[str, ...]
+) -> dict[str, float]:
+    """The finite numbers of a table's row by their columns, some of them not negative.
+
+    Raises:
+        DataError: Another number of cells, or a cell that is no such number; with its column.
+    """
     if len(cells) != len(names):
         raise DataError(f"{len(cells)} columns", where=where, allowed=f"{len(names)}: {', '.join(names)}")
     row = {}
     for column, (name, text) in enumerate(zip(names, cells, strict=True), 1):
-        low, value = 0.0 if name in NOT_NEGATIVE else -math.inf, number_of(text)
+        low, value = 0.0 if name in not_negative else -math.inf, number_of(text)
         if value is None or not math.isfinite(value) or value < low:
             raise DataError(
                 f"{name} is {text.strip()!r}",

@@ -19,12 +19,12 @@ from typing import Any
 
 import numpy as np
 
-from lidardesign.constraints.document import MOST_FITTED, Constraints, SensorConstraints, merged
+from lidardesign.constraints.document import MOST_FITTED, Constraints, SensorConstraints
 from lidardesign.constraints.origins import axes_outside, place_text, snap_place_to_space
 from lidardesign.errors import ConfigError, DataError, InfeasibleError
 from lidardesign.numerics import SLACK
 from lidardesign.run.validation import is_name
-from lidardesign.run.yaml import plain_number
+from lidardesign.run.yaml import merged, plain_number
 from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.pattern import Pattern

@@ -44,14 +44,14 @@ class Scope:
         element: Its element.
         path: The file.
         parent: The enclosing scope; None for the file's topmost.
-        found: Resolved poses by name; None marks one that is being resolved.
+        found: Resolved poses by name.
         waiting: Names whose poses are being resolved, in all scopes of the file.
     """
 
     element: ElementTree.Element
     path: Path
     parent: Scope | None = None
-    found: dict[str, np.ndarray | None] = field(default_factory=dict)
+    found: dict[str, np.ndarray] = field(default_factory=dict)
     waiting: list[str] = field(default_factory=list)
     _nested: dict[int, Scope] = field(default_factory=dict)
 
@@ -98,17 +98,13 @@ class Scope:
         if name in ("", MODEL_FRAME) or (name == WORLD_FRAME and self.element.tag == WORLD_FRAME):
             return np.eye(4)
         if name in self.found:
-            known = self.found[name]
-            if known is None:
-                raise DataError(f"the pose of {name!r} is relative to itself", where=self.where(asking))
-            return known
+            return self.found[name]
         if len(self.waiting) >= LONGEST_CHAIN:
             raise DataError(
-                f"the pose of {self.waiting[0]!r} is relative to too many others, one after the other",
+                f"the pose of {self.waiting[0]!r} is relative to itself, or to too many others, one after the other",
                 where=self.where(asking),
                 allowed=f"at most {LONGEST_CHAIN}",
             )
-        self.found[name] = None
         self.waiting.append(name)
         outer, _, inner = name.partition(SEPARATOR)
         model = self._named.get(("model", outer)) if inner else None

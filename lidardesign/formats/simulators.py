@@ -259,7 +259,18 @@ def write_isaac_usd(design: DesignSpec, rays: Rays, path: Path, rate_hz: float =
         "{",
     ]
     for mount in mounted:
-        lines += _prim(mount, rays, whole_hz)
+        lines += [
+            f'    def OmniLidar "{mount.name}" (',
+            f"        displayName = {quoted(mount.sensor.name)}",
+            f"        prepend apiSchemas = {json.dumps(SCHEMAS)}",
+            "    )",
+            "    {",
+            *(f"        {kind} {name} = {value}" for kind, name, value in _attributes(mount, rays, whole_hz)),
+            f"        double3 xformOp:translate = {_tuple(mount.origin_m)}",
+            f"        quatd xformOp:orient = {_tuple(mount.quaternion)}",
+            '        uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:orient"]',
+            "    }",
+        ]
     write_atomic(path, "\n".join([*lines, "}"]) + "\n")
     notes = [*design_losses(design, mounted), *origin_losses(mounted)]
     if whole_hz != rate_hz:
@@ -281,21 +292,6 @@ def quoted(text: str) -> str:
     """
     plain = "".join(letter if letter.isprintable() else " " for letter in text)
     return '"' + plain.replace("\\", "\\\\").replace('"', '\\"') + '"'
-
-
-def _prim(mount: Mount, rays: Rays, rate_hz: int) -> list[str]:
-    return [
-        f'    def OmniLidar "{mount.name}" (',
-        f"        displayName = {quoted(mount.sensor.name)}",
-        f"        prepend apiSchemas = {json.dumps(SCHEMAS)}",
-        "    )",
-        "    {",
-        *(f"        {kind} {name} = {value}" for kind, name, value in _attributes(mount, rays, rate_hz)),
-        f"        double3 xformOp:translate = {_tuple(mount.origin_m)}",
-        f"        quatd xformOp:orient = {_tuple(mount.quaternion)}",
-        '        uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:orient"]',
-        "    }",
-    ]
 
 
 def _attributes(mount: Mount, rays: Rays, rate_hz: int) -> list[tuple[str, str, str]]:

@@ -32,7 +32,7 @@ INWARD = SLACK
 # Rolls beyond this would swap what is called horizontal and vertical.
 LARGEST_ROLL_RAD = math.pi / 4
 
-Pins = tuple[float | None, float | None, float | None]
+Pins = tuple[float | None, ...]
 
 
 @dataclass(frozen=True)
@@ -166,8 +166,7 @@ def pins_of(rules: SensorRules, space: DesignSpace) -> Pins:
     """The origin coordinates that a sensor's rules pin and the space does not."""
     low, high = origin_box(rules, space)
     pinned = [i in space.free and high[i] - low[i] <= PINNED_BOX_M for i in range(3)]
-    x, y, z = (float(low[i]) if pinned[i] else None for i in range(3))
-    return x, y, z
+    return tuple(float(low[i]) if pinned[i] else None for i in range(3))
 
 
 def sensor_groups(rules: Sequence[SensorRules], space: DesignSpace, count: int) -> list[Group]:

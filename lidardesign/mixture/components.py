@@ -24,6 +24,7 @@ from functools import cached_property
 import numpy as np
 
 from lidardesign.numerics import ROUNDING, SLACK, wrap_angle
+from lidardesign.sensors.sensor import boresight_frame
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction
 
 # Samples per block: arrays of 10 components then stay inside a core's second-level cache (measured).
@@ -69,7 +70,7 @@ class Mixture:
     @property
     def frames(self) -> np.ndarray:
         """Rows forward, horizontal, vertical of each boresight, roll included, shape (K, 3, 3)."""
-        return frames(self.azimuth_rad, self.elevation_rad, self.roll_rad)
+        return boresight_frame(self.azimuth_rad, self.elevation_rad, self.roll_rad)
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,17 +88,6 @@ class Statistics:
     mass: np.ndarray
     phi: np.ndarray
     tangent: np.ndarray
-
-
-def frames(azimuth_rad: np.ndarray, elevation_rad: np.ndarray, roll_rad: np.ndarray) -> np.ndarray:
-    """`sensor.boresight_frame` for many boresights at once: (K,) each to (K, 3, 3)."""
-    sin_a, cos_a = np.sin(azimuth_rad), np.cos(azimuth_rad)
-    sin_e, cos_e = np.sin(elevation_rad), np.cos(elevation_rad)
-    sin_r, cos_r = np.sin(roll_rad)[:, None], np.cos(roll_rad)[:, None]
-    forward = np.stack([cos_e * cos_a, cos_e * sin_a, sin_e], axis=-1)
-    horizontal = np.stack([-sin_a, cos_a, np.zeros_like(sin_a)], axis=-1)
-    vertical = np.stack([-sin_e * cos_a, -sin_e * sin_a, cos_e], axis=-1)
-    return np.stack([forward, cos_r * horizontal + sin_r * vertical, cos_r * vertical - sin_r * horizontal], axis=1)
 
 
 def angle_ratio(cosine: np.ndarray, out: np.ndarray, work: np.ndarray) -> np.ndarray:

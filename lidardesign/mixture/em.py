@@ -44,8 +44,6 @@ SEED_LLOYD_ITERATIONS = 4
 # A component that rests on fewer effective samples is no sensor: it begins again where there are more.
 LEAST_SAMPLES = 20.0
 MOST_REVIVALS = 3
-# The first samples checked for more distinct ones than components: usually enough.
-FEW_SAMPLES = 256
 # Shorter boresight steps than this share are as good as none.
 SMALLEST_STEP = 0.02
 # Mass that stands for an empty cell, so that its mean is finite.
@@ -207,10 +205,9 @@ def fit_mixture(
     if start is None:
         start = _best_seed(features, bounds, generator, 1 if len(bounds) == 1 else max(restarts, 1))
     result = _revive_dead(run_em(start, features, bounds), features, bounds, generator)
-    for part in (features.points[: max(len(bounds), FEW_SAMPLES)], features.points):
-        different = len(np.unique(part, axis=0))
-        if different >= len(bounds):
-            return result
+    different = len(np.unique(features.points, axis=0))
+    if different >= len(bounds):
+        return result
     shared = f"fewer different samples ({different}) than sensors ({len(bounds)}): some sensors share a sample"
     return replace(result, notes=(shared, *result.notes))
 

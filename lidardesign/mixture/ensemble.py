@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
@@ -98,7 +99,9 @@ class Ensemble:
         results = []
         for part, result in zip(self.parts, self.results, strict=True):
             bounds = part.bounds.narrowed(width_m)
-            start = admitted_mixture(result.mixture, part.features, bounds)
+            # one M-step from its own statistics takes the fit inside other bounds
+            statistics, floors = expect(result.mixture, part.features), Floors.of(part.features)
+            start = maximise(result.mixture, statistics, part.features, bounds, floors, 0.0)
             results.append(replace(run_em(start, part.features, bounds), notes=result.notes))
         return Ensemble(self.parts, tuple(results))
 
@@ -111,11 +114,6 @@ def fit_groups(parts: Sequence[GroupSamples], seed: int, restarts: int) -> Ensem
         for index, part in enumerate(parts)
     ]
     return Ensemble(tuple(parts), tuple(results))
-
-
-def admitted_mixture(mixture: Mixture, features: Features, bounds: Bounds) -> Mixture:
-    """The parameters of a fit inside other bounds: one M-step from its own statistics."""
-    return maximise(mixture, expect(mixture, features), features, bounds, Floors.of(features), 0.0)
 
 
 def sensors_of(ensemble: Ensemble, space: DesignSpace) -> tuple[Sensor, ...]:
@@ -200,17 +198,16 @@ def _views(
 ) -> dict[tuple[int, Mount], np.ndarray]:
     """Weights of drawn samples re-aimed from each mount of each sensor, (N,) each; 0 where unseen."""
     drawn = systematic_draw(samples.weights, MOUNT_SAMPLES, random_generator(seed, "mounts"))
-    last = len(rules) - 1
-    views: dict[tuple[int, Mount], np.ndarray] = {}
-    for sensor, mounts in enumerate(options):
-        for mount in mounts:
-            # sensors beyond the entries of `each` are alike
-            view = views.get((last, mount)) if sensor > last else None
-            if view is None:
-                fixed = fix_origin(rules_of(rules, sensor), mount)
-                group = Group(pins_of(fixed, samples.space), (0,))
-                view = reaim_samples(samples, drawn, (fixed,), group, retarget)[1]
-            views[sensor, mount] = view
+
+    @cache
+    def seen_by(entry: int, mount: Mount) -> np.ndarray:
+        fixed = fix_origin(rules[entry], mount)
+        group = Group(pins_of(fixed, samples.space), (0,))
+        return reaim_samples(samples, drawn, (fixed,), group, retarget)[1]
+
+    # sensors beyond the entries of `each` are alike
+    pairs = [(sensor, mount) for sensor, mounts in enumerate(options) for mount in mounts]
+    views = {(sensor, mount): seen_by(min(sensor, len(rules) - 1), mount) for sensor, mount in pairs}
     if not any(view.any() for view in views.values()):
         names = [rules[0].path("origin.mounts_m")]
         raise InfeasibleError(

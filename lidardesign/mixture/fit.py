@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lidardesign.constraints.document import MOST_FITTED, Constraints, SensorRules, rules_of
-from lidardesign.constraints.feasibility import BandwidthBudget, check_feasible, fit_within_budget, most_rays
+from lidardesign.constraints.feasibility import BandwidthBudget, affordable_bins, check_feasible, most_rays
 from lidardesign.constraints.origins import fix_origins, is_mounted, most_mounted
 from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.estimates import Estimate, effective_share_error
@@ -31,7 +31,7 @@ from lidardesign.mixture.ensemble import (
     sensors_of,
 )
 from lidardesign.mixture.support import Retarget, Support, check_support, pin_samples, restrict_samples
-from lidardesign.numerics import TINY, effective_count, systematic_draw
+from lidardesign.numerics import COARSE_SLACK, TINY, effective_count, systematic_draw
 from lidardesign.run.clock import phase
 from lidardesign.samples import Samples
 from lidardesign.sensors.sensor import DEFAULT_LEVEL, Sensor, interval_factor
@@ -43,6 +43,9 @@ EM_SAMPLES = 20_000
 RESTARTS = 12
 # A field of view this near to the widest that it may have would be wider.
 WIDEST = 0.999
+# A cap of n bins is this share narrower, so that its width never rounds up to n + 1 bins.
+BIN_MARGIN = COARSE_SLACK
+MOST_REFITS = 12
 ATTEMPTS = 3  # starts of a fit of which a sensor gets too little of the density
 TOO_FEW = ("--sensors",)  # what then conflicts
 
@@ -157,7 +160,7 @@ def _fit(problem: FitProblem) -> FittedSensors:
     loose = [index for index in range(count) if _is_loose(rules_of(rules, index), samples)]
     if loose:
         ensemble, rules, supports = _fixed(problem, rules, ensemble, loose, count)
-    ensemble, rays = fit_within_budget(ensemble, Ensemble.narrowed, lambda e: (e.widths_m, e.weights), budget)
+    ensemble, rays = _within_budget(ensemble, budget)
     _check_effective(ensemble, supports)
     sensors = sensors_of(ensemble, samples.space)
     sensors = sensors if constraints.each else heaviest_first(sensors)
@@ -268,6 +271,39 @@ def _fixed(
         return whole, fixed, supports
     supports = _supports(problem, fixed, count, loose, _belonging(problem.samples, ensemble, count))
     return fit_groups(_group_samples(problem, fixed, supports, count), problem.seed, problem.restarts), fixed, supports
+
+
+def _within_budget(ensemble: Ensemble, budget: BandwidthBudget) -> tuple[Ensemble, int | None]:
+    """A fit that keeps the bandwidth, and its number of rays.
+
+    Where it is too expensive its gates are narrowed to a common number of bins and it is continued from where it was,
+    until the count of whole bins keeps the budget.
+
+    Raises:
+        InfeasibleError: Even the narrowest admitted gates exceed the budget.
+    """
+    widths, weights = ensemble.widths_m, ensemble.weights
+    if budget.limit_mbps is None:
+        return ensemble, budget.rays
+    rays = budget.rays if budget.rays is not None else budget.affordable_rays(widths, weights)
+    if budget.fits(widths, weights, rays):
+        return ensemble, rays
+    bins = affordable_bins(budget, widths, weights, rays)
+    for _ in range(MOST_REFITS):
+        ensemble = ensemble.narrowed((1 - BIN_MARGIN) * max(bins, 1) * budget.model.bin_m)
+        widths, weights = ensemble.widths_m, ensemble.weights
+        if budget.fits(widths, weights, rays):
+            return ensemble, rays
+        if bins <= 1:
+            break
+        bins = min(bins - 1, affordable_bins(budget, widths, weights, rays))
+    needed = budget.mbps(widths, weights, rays)
+    raise InfeasibleError(
+        f"{rays} rays still need {needed:g} Mbit/s with the narrowest gates that the other constraints allow",
+        conflicts=["budget.bandwidth_mbps", *budget.names],
+        allowed=f"at most {budget.limit_mbps:g} Mbit/s",
+        hint="fewer rays, narrower gates, or more bandwidth",
+    )
 
 
 def _belonging(samples: Samples, ensemble: Ensemble, count: int) -> np.ndarray:

@@ -18,9 +18,10 @@ import math
 import numpy as np
 
 from lidardesign.mixture.bounds import LARGEST_ROLL_RAD, Bounds, Floors, clip_azimuth
-from lidardesign.mixture.components import SMALLEST_WEIGHT, Features, Mixture, Statistics, frames
+from lidardesign.mixture.components import SMALLEST_WEIGHT, Features, Mixture, Statistics
 from lidardesign.mixture.origin_step import OriginLimits, best_origins
 from lidardesign.numerics import COARSE_SLACK, SLACK, box_quadratic_minimum, sphere_exp, sphere_log, wrap_angle
+from lidardesign.sensors.sensor import boresight_frame
 
 # A component with less than this share of the samples keeps its parameters: its moments are rounding noise.
 SMALLEST_MASS = SLACK
@@ -154,7 +155,7 @@ def _fit_directions(
         return mixture.azimuth_rad, mixture.elevation_rad, mixture.roll_rad, mixture.spread_rad
     mean = tangent[:, :, 0]
     azimuth, elevation = _move_boresights(mixture, step * mean, bounds, (axes.horizontal, axes.vertical))
-    old, new = mixture.frames, frames(azimuth, elevation, np.zeros(len(mixture)))
+    old, new = mixture.frames, boresight_frame(azimuth, elevation)
     # tangent coordinates of the new boresights in the old frames
     local = np.einsum("kij,kj->ki", old, new[:, 0])
     taken = sphere_log(local)
@@ -193,7 +194,7 @@ def _move_boresights(
     high = np.stack([high, np.where(bounds.elevation_high >= math.pi / 2, np.inf, high_tilt)], 1)
     precision = rotation @ (np.square(1 / mixture.spread_rad)[:, :, None] * np.swapaxes(rotation, 1, 2))
     step = box_quadratic_minimum(precision, east_north, np.minimum(low, high), high) * np.array(used, dtype=np.float64)
-    level = frames(mixture.azimuth_rad, mixture.elevation_rad, np.zeros(len(mixture)))
+    level = boresight_frame(mixture.azimuth_rad, mixture.elevation_rad)
     forward = np.einsum("kj,kji->ki", sphere_exp(step), level)
     azimuth = np.arctan2(forward[:, 1], forward[:, 0]) if used[0] else mixture.azimuth_rad
     elevation = np.arctan2(forward[:, 2], np.hypot(forward[:, 0], forward[:, 1])) if used[1] else mixture.elevation_rad

@@ -26,10 +26,8 @@ import numpy as np
 
 from lidardesign.numerics import SLACK, SQUARABLE, box_quadratic_minimum, clipped_eigenvalues
 
-# Alternations of both steps, and rounds over the axes in the first: an iteration of the mixture starts where the one
-# before ended, so the rest follows.
+# Alternations of both steps: an iteration of the mixture starts where the one before ended, so the rest follows.
 BOX_ALTERNATIONS = 2
-AXIS_ROUNDS = 1
 # Updates of the Lagrange multipliers of bounded variances: the first is exact where one is bounded.
 FORCE_ROUNDS = 6
 # What rounding may leave of a narrow box counts as this wide, so that its inverse has a finite square [m].
@@ -188,7 +186,7 @@ def _scaled(
     deviations = np.sqrt(variances(covariance))
     inverse = np.linalg.inv(covariance / (deviations[:, :, None] * deviations[:, None, :]))
     precision, shift = 1 / deviations, (mean - point) / deviations
-    for axis in np.tile(np.arange(mean.shape[1]), AXIS_ROUNDS):
+    for axis in range(mean.shape[1]):
         others = inverse[:, axis].copy()
         others[:, axis] = 0.0
         own = inverse[:, axis, axis]

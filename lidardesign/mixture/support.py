@@ -207,7 +207,7 @@ MOVED_SAMPLES = 20_000
 def at_condition(
     samples: Samples,
     condition: Mapping[str, float],
-    retarget: Retarget | None,
+    retarget: Retarget,
     count: int,
     generator: np.random.Generator,
 ) -> Samples:
@@ -224,19 +224,13 @@ def at_condition(
         Samples in `samples.space.at(condition)`; their effective sample size says what they are worth.
 
     Raises:
-        ConfigError: A name that is no condition, a value outside its bounds, or no target density to ask.
+        ConfigError: A name that is no condition, or a value outside its bounds.
         DataError: The effective number of samples is too small for a fit.
         NumericalError: The target density is NaN somewhere.
     """
     space = samples.space.at(condition)
     if not condition:
         return samples
-    if retarget is None:
-        raise ConfigError(
-            f"the density at {condition_text(condition)} needs the target density",
-            where="--at",
-            hint="give the run folder, or a design that lies in its run",
-        )
     # the nearest samples in a random order; distances are shares of each condition's bounds
     order = generator.permutation(len(samples))
     squared, values = np.zeros(len(samples)), {DIMENSIONS.index(name): value for name, value in condition.items()}

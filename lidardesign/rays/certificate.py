@@ -17,7 +17,6 @@ Without a budget lambda is the price that bandwidth was given, and lambda B is l
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -35,19 +34,6 @@ PROGRESS = 0.02  # of what the bound exceeds the value by: a bound that is lower
 PROXY = "mean over items of what the returns of the chosen rays leave unknown, by the task's informs"
 PRICES = 7  # of the curve, besides 0: each half of the one before, from twice the worth per bit of a free choice
 MEMORY = 0.7  # how much of its last direction a step keeps
-
-
-@dataclass(frozen=True)
-class Certificate:
-    """The objective of a choice with an upper bound over all choices of the candidates.
-
-    Arguments:
-        value: F - price * bits - harm of the choice; without a price F - harm.
-        bound: The least upper bound of it that was found, never below `value`.
-    """
-
-    value: float
-    bound: float
 
 
 def certificate_document(
@@ -95,8 +81,8 @@ def certify(
     budget_mbps: float | None = None,
     full: bool = True,
     rounds: int = ROUNDS,
-) -> Certificate:
-    """The bound for choices of the same candidates, counts, and price or budget.
+) -> tuple[float, float]:
+    """The objective of a choice, and a bound for choices of the same candidates, counts, and price or budget.
 
     Arguments:
         coverage: Information of the candidates.
@@ -105,6 +91,10 @@ def certify(
         budget_mbps: Largest bandwidth, if there is a budget [Mbit/s].
         full: Whether counts are filled, as in `choose`.
         rounds: Largest number of steps.
+
+    Returns:
+        F - price * bits - harm of the choice, without a price F - harm; and the least upper bound of it over all
+        choices that was found, never below it.
     """
     value = choice.worth - choice.harm - (0.0 if budget_mbps is not None else choice.price * choice.bits)
     dual = Thresholds if len(coverage.table) == 0 else Tangents
@@ -114,7 +104,7 @@ def certify(
         bound = min(bound, search.step(value))
         if bound - value <= COARSE_SLACK * abs(value):
             break
-    return Certificate(value, max(bound, value))
+    return value, max(bound, value)
 
 
 class _Admissible:

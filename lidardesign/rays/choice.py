@@ -76,6 +76,7 @@ class _Search:
 
     def __init__(self, coverage: Coverage, counts: RayCounts) -> None:
         self.coverage, self.group, self.left = coverage, counts.group, counts.most.copy()
+        self.table = coverage.entries, coverage.by_item
         self.owner = counts.owner
         self.kept = np.zeros(coverage.shape[0], dtype=bool)
         self.cost = coverage.harm
@@ -110,11 +111,6 @@ class _Search:
         gate = np.maximum(self.gate, self.earlier)
         return Choice(gate, self.coverage.value_of(gate), *self.coverage.charge(gate), price)
 
-    @property
-    def is_open(self) -> bool:
-        """Whether this layer has rays and more may fire."""
-        return bool((self.gate >= 0).any() and (self.left > 0).any())
-
     def begin_layer(self) -> None:
         """Keep the rays that fire, and forget what they inform about."""
         self.earlier = np.maximum(self.gate, self.earlier)
@@ -132,7 +128,7 @@ class _Search:
     def take(self, ray: int, gate: int) -> None:
         """Add a ray with a gate."""
         gain = self.gains[ray, gate]
-        self._change(ray, gate, adding=True)
+        kernels.change_choice(ray, gate, True, *self.table, self.gate, self.known, self.gains)
         self._count(ray, gate, gain)
 
     def _count(self, ray: int, gate: int, gain: float) -> None:
@@ -145,14 +141,10 @@ class _Search:
         """Remove a ray."""
         gate = int(self.gate[ray])
         self.gate[ray] = -1
-        self._change(ray, gate, adding=False)
+        kernels.change_choice(ray, gate, False, *self.table, self.gate, self.known, self.gains)
         self.worth -= self.gains[ray, gate]
         self.left[self.group[ray]] += 1
         self.spent_mbps -= self.coverage.bits[ray, gate]
-
-    def _change(self, ray: int, gate: int, *, adding: bool) -> None:
-        coverage = self.coverage
-        kernels.change_choice(ray, gate, adding, coverage.entries, coverage.by_item, self.gate, self.known, self.gains)
 
     def take_one_of_each(self, owner: np.ndarray) -> None:
         """Take the best ray of every sensor that fires none."""
@@ -238,7 +230,8 @@ def _choose_layers(
     if kept is not None:
         search.keep(kept)
     search.improve(prices[0], limit_mbps, full=full, passes=passes if layered else 0)
-    while layered and full and search.is_open:
+    # while this layer has rays and more may fire
+    while layered and full and (search.gate >= 0).any() and (search.left > 0).any():
         search.begin_layer()
         search.improve(prices[0], limit_mbps, full=full, passes=passes)
     if full:

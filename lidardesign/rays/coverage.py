@@ -14,12 +14,9 @@ from functools import cached_property
 
 import numpy as np
 
-from lidardesign.errors import ConfigError, PluginError
-from lidardesign.numerics import SLACK
 from lidardesign.rays import kernels
 from lidardesign.rays.training import LARGEST, InformedScene
 
-MOST_GATES = 8  # of a ray: an entry keeps one bit for each
 # Where a sensor may fail: how much the mean over losses counts, and of how many sensors an item's loss is asked.
 # The mean over losses alone lets two sensors see the same: faces are 11 % worse while both live, and lose no less.
 LOSS_SHARE, MOST_LOSSES = 0.5, 4
@@ -50,16 +47,6 @@ class Coverage:
     harm: np.ndarray
     table: np.ndarray = field(default_factory=lambda: LARGEST)
     complete: float = 1.0
-
-    def __post_init__(self) -> None:
-        """Raises `PluginError` where the table of sums is not concave, nondecreasing and 0 at 0."""
-        rises = np.diff(self.table)
-        if len(self.table) and (self.table[0] != 0 or (rises < 0).any() or (np.diff(rises) > SLACK * rises[0]).any()):
-            raise PluginError(
-                f"the table of sums is {np.array2string(self.table)}",
-                where="informs",
-                allowed="0 at 0, never falling, and never rising faster than before",
-            )
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -198,17 +185,11 @@ def gather(informed: Iterable[InformedScene], gates_m: np.ndarray, bits: np.ndar
 
     Arguments:
         informed: The task's information in each scene.
-        gates_m: The gates of each ray, start included and end not, shape (N, G, 2) [m].
+        gates_m: The gates of each ray, 8 at most, start included and end not, shape (N, G, 2) [m].
         bits: Bandwidth of a ray with each gate, inf for gates that are not allowed, (N, G) [Mbit/s].
-
-    Raises:
-        ConfigError: No scene, or more gates than an entry has bits.
     """
     rays, gates = bits.shape
-    if gates > MOST_GATES:
-        raise ConfigError(f"{gates} gates per ray", where="selection", allowed=f"at most {MOST_GATES}")
-    columns: tuple[list[np.ndarray], ...] = ([], [], [], [])
-    weights, items, sums = [], 0, LARGEST
+    parts, weights, items, sums = [], [], 0, LARGEST
     harm, complete = np.zeros((rays, gates)), 0.0
     small = np.uint16 if rays <= np.iinfo(np.uint16).max else np.int32
     for scene in informed:
@@ -218,18 +199,16 @@ def gather(informed: Iterable[InformedScene], gates_m: np.ndarray, bits: np.ndar
         heard = passes > 0
         # few bytes each, as there are many; small integers are sorted fast
         found = (scene.ray.astype(small), np.int32(items) + scene.item, scene.worth, passes)
-        for column, values in zip(columns, found, strict=True):
-            column.append(values[heard])
+        parts.append([values[heard] for values in found])
         spoils = _passes(scene.harm_range_m, scene.spoiling, gates_m)
         for gate in range(gates):
             harm[:, gate] += np.bincount(scene.spoiling, np.where(spoils >> gate & 1, scene.harm, 0.0), rays)
         weights.append(scene.weight)
         items, complete, sums = items + len(scene.weight), complete + scene.complete, scene.sums
-    if not weights:
-        raise ConfigError("no scene", where="selection", allowed="at least one training scene")
-    ray = _joined(columns[0])
+    ray, *others = (np.concatenate(column) for column in zip(*parts, strict=True))
+    parts.clear()  # they may be large
     order = np.argsort(ray, kind="stable")
-    item, worth, opens = (_joined(column)[order] for column in columns[1:])
+    item, worth, opens = (column[order] for column in others)
     start, best = _begins(ray, rays), np.empty(items, dtype=np.int32)
     # items with the same best ray are numbered in a row: loops from rays to items then read neighbouring memory
     kernels.best_rays(start, item, worth, best)
@@ -246,13 +225,6 @@ def gather(informed: Iterable[InformedScene], gates_m: np.ndarray, bits: np.ndar
         table=sums,
         complete=complete / len(weights),
     )
-
-
-def _joined(parts: list[np.ndarray]) -> np.ndarray:
-    """Parts as one array; the list is cleared to free memory."""
-    joined = np.concatenate(parts)
-    parts.clear()
-    return joined
 
 
 def _begins(labels: np.ndarray, count: int) -> np.ndarray:

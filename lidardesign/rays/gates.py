@@ -7,7 +7,7 @@ returns outside; the choice decides between them.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -29,11 +29,25 @@ FEWEST_RETURNS = 3  # of a ray by itself, below which its gates rest on those of
 THINNEST_GATE_M = 1.5e-5
 
 
-@dataclass(frozen=True, eq=False)
-class GateLimits:
-    """Limits of the gates of a design's rays.
+@phase("gates")
+def admitted_choices(
+    rays: Rays,
+    visits: Sequence[slice],
+    informed: Sequence[InformedScene],
+    *,
+    sensors: Sequence[Sensor],
+    rules: Sequence[SensorRules],
+    level: float,
+    space: DesignSpace,
+    margin_m: float,
+    is_shared: bool,
+) -> np.ndarray:
+    """A few gates for each of some rays inside the limits of a design, (N, G, 2) [m].
 
     Arguments:
+        rays: Candidates, with the widest gates that they may have.
+        visits: The rays at each condition; only those of one are near each other.
+        informed: What the task says of training scenes.
         sensors: The sensors that fire the rays.
         rules: Their constraints.
         level: The share of each marginal that intervals hold.
@@ -41,31 +55,14 @@ class GateLimits:
         margin_m: Margin at both ends of gates that hold all returns, for other scenes [m].
         is_shared: Whether all rays of a sensor have one gate.
     """
-
-    sensors: Sequence[Sensor]
-    rules: Sequence[SensorRules]
-    level: float
-    space: DesignSpace
-    margin_m: float
-    is_shared: bool
-
-    @phase("gates")
-    def choices(self, rays: Rays, visits: Sequence[slice], informed: Sequence[InformedScene]) -> np.ndarray:
-        """A few gates for each of some rays inside these limits, (N, G, 2) [m].
-
-        Arguments:
-            rays: Candidates, with the widest gates that they may have.
-            visits: The rays at each condition; only those of one are near each other.
-            informed: What the task says of training scenes.
-        """
-        gates_m = (sensor_gates if self.is_shared else gate_choices)(rays, visits, informed, self.margin_m)
-        for index, sensor in enumerate(self.sensors):
-            own = rays.sensor == index
-            wanted = gates_m[own].reshape(-1, 2)
-            bounds = bounds_of(self.rules, self.space, (index,), interval_factor(self.level))
-            allowed = bounded_gates(wanted, sensor, bounds.take(np.zeros(len(wanted), dtype=np.int64)))
-            gates_m[own] = allowed.reshape(-1, *gates_m.shape[1:])
-        return gates_m
+    gates_m = (sensor_gates if is_shared else gate_choices)(rays, visits, informed, margin_m)
+    for index, sensor in enumerate(sensors):
+        own = rays.sensor == index
+        wanted = gates_m[own].reshape(-1, 2)
+        bounds = bounds_of(rules, space, (index,), interval_factor(level))
+        allowed = bounded_gates(wanted, sensor, bounds.take(np.zeros(len(wanted), dtype=np.int64)))
+        gates_m[own] = allowed.reshape(-1, *gates_m.shape[1:])
+    return gates_m
 
 
 def gate_choices(rays: Rays, visits: Sequence[slice], informed: Sequence[InformedScene], margin_m: float) -> np.ndarray:

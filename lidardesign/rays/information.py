@@ -96,7 +96,8 @@ def require_valid(information: Information, rays: int, frames: int, where: str =
     pairs, items = len(information.ray), len(information.frame)
     weight = np.ones(items) if information.weight is None else np.asarray(information.weight)
     harm = np.zeros((frames, rays)) if information.harm is None else np.asarray(information.harm)
-    most = 0.0 if information.sums is None else float(np.max(information.sums, initial=0.0))
+    sums = np.zeros(1) if information.sums is None else np.asarray(information.sums)
+    most, rises = float(np.max(sums, initial=0.0)), np.diff(sums)
     seen_in = np.zeros(0, dtype=int) if information.seen_in is None else information.seen_in
     faults = {
         "ray, item and worth of different lengths": not len(information.item) == len(information.worth) == pairs,
@@ -106,6 +107,9 @@ def require_valid(information: Information, rays: int, frames: int, where: str =
         "a unit that is not text": not isinstance(information.unit, str),
         "weights that are all zero": items > 0 and not weight.sum() > 0,
         f"sums up to {most:g}, above complete, {information.complete:g}": most > (1 + SLACK) * information.complete,
+        f"sums {np.array2string(sums)} that are not 0 at 0, or fall, or rise faster than before": (
+            (sums[:1] != 0).any() or (rises < 0).any() or (np.diff(rises) > SLACK * rises[:1]).any()
+        ),
     }
     for name, index, count in (
         ("ray", information.ray, rays),

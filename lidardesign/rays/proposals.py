@@ -67,7 +67,7 @@ class Proposals:
         """
         samples, least = nearest_samples(self.samples, at), np.zeros(len(self.sensors)) if least is None else least
         sensors = self.sensors_at(at)
-        owner, fired = self.owners(sensors, samples.points, samples.space)
+        owner, fired = owners(sensors, self.rules, self.level, samples.points, samples.space, by_turns=self.by_turns)
         inside = np.flatnonzero((owner >= 0) & (samples.weights > 0))
         # the same ray at another range is the same candidate
         _, first, same = np.unique(fired[inside, :RANGE], axis=0, return_index=True, return_inverse=True)
@@ -82,12 +82,6 @@ class Proposals:
         if even.any():
             rays = Rays.joined([rays, even_rays(sensors, even)])
         return replace(rays, time_s=np.zeros(len(rays)))
-
-    def owners(
-        self, sensors: Sequence[Sensor], points: np.ndarray, space: DesignSpace
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """As the function `owners`, of sensors as they stand at a value of the condition."""
-        return owners(sensors, self.rules, self.level, points, space, by_turns=self.by_turns)
 
     def share_of_several(self, at: Mapping[str, float]) -> float:
         """The share of what the sensors see of the density, at a value of the condition, that several of them see."""

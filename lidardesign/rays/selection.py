@@ -142,8 +142,9 @@ class Selection:
         """
         limit, worth, gap = None if np.isinf(self.limit_mbps) else self.limit_mbps, 0.0, 0.0
         for visit, choice in zip(self.visits, choices, strict=True):
-            found = certify(coverage.of_rays(visit), self.counts(len(choice.rays), visit), choice, budget_mbps=limit)
-            worth, gap = worth + choice.worth - choice.harm, gap + found.bound - found.value
+            own, counts = coverage.of_rays(visit), self.counts(len(choice.rays), visit)
+            value, bound = certify(own, counts, choice, budget_mbps=limit)
+            worth, gap = worth + choice.worth - choice.harm, gap + bound - value
         loss = coverage.complete - worth
         return loss, min(max(loss - gap, 0.0), loss)  # losses are not negative
 

@@ -17,7 +17,6 @@ from lidardesign.rays.information import (
     MOST_ITEMS,
     checked_information,
     choosing,
-    require_valid,
 )
 from lidardesign.run.clock import phase
 from lidardesign.run_folder import RunFolder
@@ -163,13 +162,8 @@ class InformedScene:
 
     @classmethod
     def of(cls, information: Information, returns: Sequence[Returns]) -> InformedScene:
-        """The information of the returns of all candidate rays, through open gates.
-
-        Raises:
-            PluginError: Invalid pairs, weights or harm.
-        """
+        """The checked information of the returns of all candidate rays, through open gates."""
         range_m = np.stack([frame.range_m for frame in returns])
-        require_valid(information, range_m.shape[1], len(returns))
         tells = np.flatnonzero(information.worth > 0)
         ray, item = information.ray[tells], information.item[tells]
         count = len(information.frame)

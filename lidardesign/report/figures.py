@@ -279,7 +279,16 @@ def plane_figure(plane: PlaneDensity) -> dict[str, Any]:
         "hovertemplate": f"%{{x:.3f}}, %{{y:.3f}} m: %{{z:.3g}} {html.escape(plane.unit)}<extra></extra>",
     }
     outlines = [
-        _outline(across, up, covered, dash)
+        {
+            "type": "contour",
+            "x": across.tolist(),
+            "y": up.tolist(),
+            "z": _array(covered),
+            "contours": {"start": 0.5, "end": 0.5, "size": 1, "coloring": "none"},
+            "line": {"color": INK, "width": 1.2, "dash": dash},
+            "showscale": False,
+            "hoverinfo": "skip",
+        }
         for covered, dash in ((plane.targets, "solid"), (plane.others, "dot"))
         if covered.any() and not covered.all()
     ]
@@ -291,19 +300,6 @@ def plane_figure(plane: PlaneDensity) -> dict[str, Any]:
         },
     }  # fmt: skip
     return {"data": [heat, *outlines], "layout": layout}
-
-
-def _outline(across: np.ndarray, up: np.ndarray, covered: np.ndarray, dash: str) -> dict[str, Any]:
-    return {
-        "type": "contour",
-        "x": across.tolist(),
-        "y": up.tolist(),
-        "z": _array(covered),
-        "contours": {"start": 0.5, "end": 0.5, "size": 1, "coloring": "none"},
-        "line": {"color": INK, "width": 1.2, "dash": dash},
-        "showscale": False,
-        "hoverinfo": "skip",
-    }
 
 
 def _array(values: np.ndarray) -> dict[str, str]:

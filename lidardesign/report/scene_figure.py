@@ -19,7 +19,7 @@ from lidardesign.numerics import TINY
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import Outcome, Rays, gate_outcomes
 from lidardesign.scenes.scene import Body, Box, Mesh, Plane, Round, Scene
-from lidardesign.scenes.surface import grid_faces, round_triangles
+from lidardesign.scenes.surface import BOX_CORNERS, BOX_QUADS, grid_faces, round_triangles
 from lidardesign.scoring.evaluation.entries import ordered_conditions
 from lidardesign.scoring.evaluation.request import EvaluationRequest, numbers_fired
 from lidardesign.scoring.evaluation.results import Evaluation
@@ -152,10 +152,8 @@ def _outcomes(
     """Drawn lengths and outcomes of each design's rays, shape (P, T, N) each."""
     casters = build_casters(scene) if planner is not None else {frame: SceneCaster(scene, frame) for frame in frames}
     found = [_first_hits(rays, [casters[frame] for frame in frames]) for rays in every]
-    if planner is None:
-        return found
     lists = [rays for one in every for rays in one]
-    physics = planner.physics(planner.plan(scene, lists, casters), seed)
+    physics = None if planner is None else planner.physics(planner.plan(scene, lists, casters), seed)
     if physics is None:
         return found
     repeats = [place for one in every for place in range(len(one))]
@@ -245,7 +243,9 @@ def own_triangles(
     elif isinstance(shape, Round):
         vertices, faces = round_triangles(shape, steps)
     elif isinstance(shape, Box):
-        vertices, faces = _box(np.asarray(shape.half_extents_m))
+        # corners of their own for every side keep the light from rounding the edges
+        vertices = (BOX_CORNERS * np.asarray(shape.half_extents_m))[np.ravel(BOX_QUADS)]
+        faces = np.array([(k, k + 1 + half, k + 2 + half) for half in (0, 1) for k in range(0, 24, 4)])
     else:
         # the part of the plane z = 0 below a scene's bounds, in the plane's own frame
         corners = np.array([[x, y, z] for x in bounds_m[:, 0] for y in bounds_m[:, 1] for z in bounds_m[:, 2]])
@@ -343,11 +343,3 @@ def _patch(sensor: Sensor, across: np.ndarray, up: np.ndarray) -> np.ndarray:
     horizontal, vertical = field_on_sphere(sensor)
     u, v = np.meshgrid(across * horizontal / 2, up * vertical / 2)
     return tangent_directions(sensor.frame, np.stack([u.ravel(), v.ravel()], axis=1)).reshape(*u.shape, 3)
-
-
-def _box(half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    # corners of their own for every side keep the light from rounding the edges
-    faces = [(k, k + 1, k + 2) for k in range(0, 24, 4)] + [(k, k + 2, k + 3) for k in range(0, 24, 4)]
-    return (signs * half)[np.ravel(quads)], np.array(faces)

@@ -33,7 +33,8 @@ from lidardesign.report.scene_figure import (
     scene_bounds,
 )
 from lidardesign.scenes.rays import Outcome
-from lidardesign.scenes.scene import Body, Scene
+from lidardesign.scenes.scene import Body, Mesh, Scene
+from lidardesign.scenes.surface import half_extents_m
 from lidardesign.sensors.pattern import field_on_sphere
 from lidardesign.sensors.sensor import Sensor, interval_factor
 
@@ -97,10 +98,7 @@ def drawn_bodies(shown: SceneFigure) -> list[Body]:
 
 def _size(body: Body) -> float:
     shape = body.shape
-    if hasattr(shape, "bounds_m"):
-        return float(np.ptp(shape.bounds_m, axis=0).max())
-    lengths = [value for entry in vars(shape).values() for value in np.atleast_1d(entry)]
-    return float(max(lengths, default=np.inf))
+    return float(max(np.ptp(shape.bounds_m, axis=0) / 2 if isinstance(shape, Mesh) else half_extents_m(shape)))
 
 
 def view_bounds(shown: SceneFigure) -> np.ndarray:

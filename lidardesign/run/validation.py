@@ -25,6 +25,11 @@ LIKE_TEXT = (str, bytes, Path)
 Model = TypeVar("Model", bound=BaseModel)
 
 
+def placed_at(where: str) -> Callable[..., str]:
+    """The position of every key path of a document that is no file: its name."""
+    return lambda path, key=False: where
+
+
 def is_name(value: Any) -> bool:
     """True for text that is not blank and has no control characters."""
     shown = isinstance(value, str) and bool(value.strip())

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -324,6 +324,15 @@ def _plain(value: Any, path: KeyPath = ()) -> Any:
             where = ".".join(map(str, path))
             raise ConfigError(f"{value!r} cannot be written to a file", where=where, allowed="UTF-8") from None
     return value
+
+
+def merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """Plain values overridden by others, key by key at every depth; neither is changed."""
+    result = dict(base)
+    for key, value in over.items():
+        under = result.get(key) if isinstance(result.get(key), Mapping) else {}
+        result[key] = merged(under, value) if isinstance(value, Mapping) else value
+    return result
 
 
 def leaves(value: Any, path: KeyPath = ()) -> Iterator[tuple[KeyPath, Any]]:

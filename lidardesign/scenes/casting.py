@@ -9,6 +9,7 @@ rays, cast once: rays exactly at vertices have probability 0 in a density.
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterator, Sequence
+from dataclasses import replace
 from typing import Literal
 from weakref import WeakKeyDictionary, WeakValueDictionary
 
@@ -276,11 +277,8 @@ class _AtRest:
     def trace(
         self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray, twice: SecondCasts | None
     ) -> Hits:
-        hits = Hits.none(len(origins))
-        if len(origins):
-            rows, range_m, geometry, normal = self.triangles.trace(origins, directions, limit_m, twice)
-            hits.range_m[rows], hits.body[rows], hits.normal[rows] = range_m, self.body_of_geometry[geometry], normal
-        return hits
+        hits = self.triangles.trace(origins, directions, limit_m, twice)
+        return replace(hits, body=np.append(self.body_of_geometry, -1)[hits.body])
 
 
 # Cached Embree scenes, by the first of their bodies and by geometry.
@@ -319,12 +317,12 @@ class _Moving:
         found = primitive_kernels.passing(*ball, self._poses[number], origins, directions, bound_m, rows, local, toward)
         return rows[:found], local[:found], toward[:found]
 
-    def enter(self, number: int, hits: Hits, rows: np.ndarray, range_m: np.ndarray, normal: np.ndarray) -> None:
-        """Write the hits of rays (K,) on a mesh into `hits`, from normals in the mesh's frame."""
-        hit = np.isfinite(range_m)
+    def enter(self, number: int, hits: Hits, rows: np.ndarray, met: Hits) -> None:
+        """Write the hits of rays (K,) on a mesh, met in the mesh's frame, into `hits`."""
+        hit = met.body >= 0
         won = rows[hit]
-        hits.range_m[won], hits.body[won] = range_m[hit], self._body[number]
-        hits.normal[won] = _turned(normal[hit], self._poses[number, :3, :3])
+        hits.range_m[won], hits.body[won] = met.range_m[hit], self._body[number]
+        hits.normal[won] = _turned(met.normal[hit], self._poses[number, :3, :3])
 
 
 def _keep_nearer(
@@ -344,11 +342,10 @@ def _keep_nearer(
         asked = [part.passing(number, origins, directions, bound) for part, bound in zip(moving, bounds, strict=True)]
         rows, local, toward = zip(*asked, strict=True)
         bound = np.concatenate([bound[some] for bound, some in zip(bounds, rows, strict=True)])
-        range_m, normal = caster.first_hits(np.concatenate(local), np.concatenate(toward), bound, twice)
+        met = caster.trace(np.concatenate(local), np.concatenate(toward), bound, twice)
         ends = np.cumsum([len(some) for some in rows])
         for part, hits, some, end in zip(moving, found, rows, ends, strict=True):
-            mine = slice(end - len(some), end)
-            part.enter(number, hits, some, range_m[mine], normal[mine])
+            part.enter(number, hits, some, met.subset(slice(end - len(some), end)))
 
 
 def _turned(vectors: np.ndarray, rotation: np.ndarray) -> np.ndarray:

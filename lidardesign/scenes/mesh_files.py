@@ -23,6 +23,7 @@ from lidardesign.run.arrays import guarded
 from lidardesign.run.inputs import MESH, check_bytes, read_file
 from lidardesign.scenes.mesh_formats import AGAIN_HINT, check_count, check_gltf, check_ply, read_obj, read_off, read_stl
 from lidardesign.scenes.scene import LARGEST_WEIGHT, Mesh, Sign, check_triangles
+from lidardesign.scenes.surface import doubled_areas
 
 if TYPE_CHECKING:
     import trimesh
@@ -78,20 +79,15 @@ def turned_to_agree(faces: np.ndarray, areas: np.ndarray) -> tuple[np.ndarray, i
     order = np.argsort(edge, kind="stable")
     starts = np.concatenate([[0], np.cumsum(count)[:-1]])[count == 2]
     one, other = order[starts], order[starts + 1]
-    side = _sides(len(faces), one // 3, other // 3, upwards[one] != upwards[other])
-    if side is None:
-        return faces, 0
-    part, flipped = side
+    part, flipped = _sides(len(faces), one // 3, other // 3, upwards[one] != upwards[other])
     # the orientation of the smaller area is flipped
     share = np.bincount(part, weights=np.where(flipped, areas, -areas))
     turn = flipped ^ (share[part] > 0)
     return np.where(turn[:, None], faces[:, ::-1], faces), int(turn.sum())
 
 
-def _sides(
-    count: int, first: np.ndarray, second: np.ndarray, agree: np.ndarray
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """Part of each face, and mask of the faces oriented against its first one; None if all agree.
+def _sides(count: int, first: np.ndarray, second: np.ndarray, agree: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Part of each face, and mask of the faces oriented against its first one.
 
     Every face is twice in a graph, once as it is and once flipped (the orientation double cover): a part whose two
     copies are connected cannot be oriented, and keeps its faces.
@@ -99,8 +95,6 @@ def _sides(
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    if agree.all():
-        return None
     across = np.where(agree, 0, count)
     rows = np.concatenate([first, first + count])
     columns = np.concatenate([second + across, (second + count) - across])
@@ -236,7 +230,13 @@ def load_mesh(path: str | Path, *, sign: Sign = "auto", scale: float = 1.0, pain
     path = Path(path)
     if not (np.isfinite(scale) and scale > 0):
         raise DataError(f"the scale {scale} is not a factor to metres", where=str(path), allowed="a positive number")
-    vertices, faces, importance = _read(path, painted)
+    if path.suffix.lower() not in SUFFIXES:
+        raise DataError(f"has the suffix {path.suffix!r}", where=str(path), allowed=", ".join(SUFFIXES))
+    data = read_file(path, MESH, hint="check the path")
+    if not data.strip():
+        raise DataError("is an empty file", where=str(path))
+    # any failure to read it becomes a `DataError`
+    vertices, faces, importance = guarded(lambda: _geometry(path, data, painted), path, AGAIN_HINT)
     with np.errstate(over="ignore", invalid="ignore"):  # too large values are refused below
         vertices = vertices * scale
     return check_mesh(vertices, faces, sign=sign, where=str(path), importance=importance)
@@ -289,7 +289,7 @@ def usable_faces(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> n
     """Faces without degenerate and duplicate ones, each with a line in `notes` where any are dropped."""
     edges = np.roll(vertices[faces], -1, axis=1) - vertices[faces]
     longest = np.einsum("fek,fek->fe", edges, edges).max(axis=1)
-    degenerate = _double_areas(vertices, faces) <= FLATTEST_TRIANGLE * longest
+    degenerate = doubled_areas(vertices[faces]) <= FLATTEST_TRIANGLE * longest
     if degenerate.any():
         notes.append(BackgroundNote(f"dropped {int(degenerate.sum())} degenerate faces (without area)"))
         faces = faces[~degenerate]
@@ -299,17 +299,12 @@ def usable_faces(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> n
     return faces[np.sort(first)]
 
 
-def _double_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    a, b, c = np.moveaxis(vertices[faces], 1, 0)
-    return np.linalg.norm(np.cross(b - a, c - a), axis=1)
-
-
 def _oriented(
     vertices: np.ndarray, faces: np.ndarray, sign: Sign, notes: list[str], where: str
 ) -> tuple[np.ndarray, Literal["solid", "winding", "unsigned"]]:
     open_edges, mixed_edges = edge_defects(faces)
     if mixed_edges and sign in ("auto", "winding"):
-        faces, turned = turned_to_agree(faces, _double_areas(vertices, faces))
+        faces, turned = turned_to_agree(faces, doubled_areas(vertices[faces]))
         mixed_edges = edge_defects(faces)[1]
         if turned:
             notes.append(BackgroundNote(f"flipped {turned} faces that were wound against their neighbours"))
@@ -339,17 +334,6 @@ def signed_volume_m3(vertices: np.ndarray, faces: np.ndarray) -> float:
     """Enclosed volume of a closed mesh, negative when its normals point inwards [m^3]."""
     a, b, c = np.moveaxis(vertices[faces] - vertices.mean(axis=0), 1, 0)
     return float(np.einsum("fk,fk->f", a, np.cross(b, c)).sum() / 6)
-
-
-def _read(path: Path, painted: Painted | None) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Vertices, faces and weights of a file; any failure to read it becomes a `DataError`."""
-    where = str(path)
-    if path.suffix.lower() not in SUFFIXES:
-        raise DataError(f"has the suffix {path.suffix!r}", where=where, allowed=", ".join(SUFFIXES))
-    data = read_file(path, MESH, hint="check the path")
-    if not data.strip():
-        raise DataError("is an empty file", where=where)
-    return guarded(lambda: _geometry(path, data, painted), path, AGAIN_HINT)
 
 
 @contextmanager

@@ -285,9 +285,7 @@ def crossings(shapes, origins, directions, starts, limits, rows, ranges, cosines
             for value in primitive_roots(kinds[b], row(sizes, b), q, along):
                 if value >= starts[n] and value < limits[n]:
                     if met < room:
-                        point = q[0] + value * along[0], q[1] + value * along[1], q[2] + value * along[2]
-                        own = primitive_normal(kinds[b], row(sizes, b), point)
-                        cosine = own[0] * along[0] + own[1] * along[1] + own[2] * along[2]
+                        _, cosine = normal_at_range(kinds[b], row(sizes, b), to_body, b, origin, direction, value)
                         rows[met], ranges[met], cosines[met] = n, value, abs(cosine)
                     met += 1
     return met

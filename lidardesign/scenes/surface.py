@@ -31,6 +31,11 @@ SIZES: dict[type, Callable[..., tuple[float, float, float]]] = {
 BALL_SLACK = ROUNDING
 
 
+# Corners of a box of half extents 1, and the corners of its sides, seen from outside against the clock.
+BOX_CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64)
+BOX_QUADS = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
+
+
 class Sampled(NamedTuple):
     """Points (K, 3) [m] and the corners of each one's triangle (K, 3, 3); on primitives all three are the point."""
 
@@ -52,7 +57,7 @@ def sample_triangles(
     if not len(faces):
         raise ValueError("a surface without faces has no points")
     corners = vertices[faces]
-    cumulated = np.cumsum(_doubled_areas(corners))
+    cumulated = np.cumsum(doubled_areas(corners))
     places = (np.arange(count) + generator.random(count)) / count * cumulated[-1]
     chosen = np.minimum(np.searchsorted(cumulated, places, side="right"), len(faces) - 1)
     root, share = np.sqrt(generator.random((count, 1))), generator.random((count, 1))
@@ -60,7 +65,8 @@ def sample_triangles(
     return (1 - root) * a + root * (1 - share) * b + root * share * c, chosen
 
 
-def _doubled_areas(corners: np.ndarray) -> np.ndarray:
+def doubled_areas(corners: np.ndarray) -> np.ndarray:
+    """Twice the areas of triangles by their corners, (N, 3, 3) to (N,) [m^2]."""
     return np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
 
 
@@ -95,7 +101,7 @@ def surface_area_m2(body: Body, space: DesignSpace) -> float:
         case Plane():
             return (2 * _reach_m(space)) ** 2
         case Mesh(vertices=vertices, faces=faces):
-            return float(_doubled_areas(vertices[faces]).sum() / 2)
+            return float(doubled_areas(vertices[faces]).sum() / 2)
 
 
 def target_area_m2(scene: Scene, space: DesignSpace) -> float:

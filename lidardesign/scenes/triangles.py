@@ -12,11 +12,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from weakref import WeakKeyDictionary, WeakValueDictionary
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from lidardesign.numerics import COARSE_SLACK, unit_vectors
+from lidardesign.scenes.rays import Hits
 from lidardesign.scenes.scene import Mesh
 
 FARTHEST_M = 1e30  # range of an unlimited ray in Embree
@@ -66,12 +67,15 @@ class Triangles:
 
     def trace(
         self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray, twice: SecondCasts | None = None
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """First hits of finite float64 rays of unit length: rows (K,), ranges (K,), meshes (K,) and normals (K, 3).
+    ) -> Hits:
+        """First hits of finite float64 rays of unit length, with the numbers of meshes as bodies.
 
         Hits at or beyond limits (N,) are misses. Normals follow the winding of the faces. With `twice`, doubtful rays
         are cast again and counted there.
         """
+        hits = Hits.none(len(origins))
+        if not len(origins):
+            return hits
         local = origins - self.centre_m
         advance_m = advances_m(local, directions, self.radius_m)
         near = local + advance_m[:, None] * directions
@@ -81,7 +85,9 @@ class Triangles:
             self._cast_again(found, near, directions, limit, twice)
         range_m = found["tfar"] + advance_m
         rows = np.flatnonzero((found["primID"] >= 0) & (range_m < limit_m))
-        return rows, range_m[rows], found["geomID"][rows], unit_vectors(found["Ng"][rows].astype(np.float64))
+        hits.range_m[rows], hits.body[rows] = range_m[rows], found["geomID"][rows]
+        hits.normal[rows] = unit_vectors(found["Ng"][rows].astype(np.float64))
+        return hits
 
     def _cast_again(
         self,
@@ -116,16 +122,6 @@ class Triangles:
         for name in ("primID", "geomID", "tfar", "Ng"):
             found[name][doubtful[nearer]] = again[name][nearer]
 
-    def first_hits(
-        self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray, twice: SecondCasts | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Ranges (N,) [m], infinite on a miss, and normals (N, 3), zero there, of rays as in `trace`."""
-        range_m, normal = np.full(len(origins), np.inf), np.zeros((len(origins), 3))
-        if len(origins):
-            rows, reached_m, _, found = self.trace(origins, directions, limit_m, twice)
-            range_m[rows], normal[rows] = reached_m, found
-        return range_m, normal
-
     def run(self, local: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> dict[str, np.ndarray]:
         """Embree's result for float32 rays."""
         return self._scene.run(local, directions, dists=limit_m, output=True)
@@ -141,14 +137,10 @@ def advances_m(local: np.ndarray, directions: np.ndarray, radius_m: np.ndarray |
 
 
 _mesh_casters: WeakKeyDictionary[Mesh, Triangles] = WeakKeyDictionary()
-_casters_by_content: WeakValueDictionary[str, Triangles] = WeakValueDictionary()
 
 
 def mesh_caster(mesh: Mesh) -> Triangles:
-    """Shared caster of a mesh in its own frame, kept as long as the mesh; meshes of equal content share it."""
+    """Shared caster of a mesh in its own frame, kept as long as the mesh."""
     if mesh not in _mesh_casters:
-        known = _casters_by_content.get(mesh.content_hash)
-        if known is None:
-            known = _casters_by_content[mesh.content_hash] = Triangles([mesh])
-        _mesh_casters[mesh] = known
+        _mesh_casters[mesh] = Triangles([mesh])
     return _mesh_casters[mesh]

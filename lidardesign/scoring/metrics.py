@@ -9,10 +9,11 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy
 
 from lidardesign.errors import DataError
 from lidardesign.numerics import SLACK
@@ -34,8 +35,6 @@ DRAW_ROUNDS = 12
 GAP_SPACINGS = 2.97
 # Of 2.5, 3, 3.5, 4 and 5 spacings this one gives the plain cropped grid its least error on faces, from 100 to 576 rays.
 MOST_SPACINGS = 3.0
-# Spacings of so many rays are kept for the next scene: those of larger frames would take up memory.
-MOST_KEPT_RAYS = 4096
 
 
 def chamfer_m(first: np.ndarray, second: np.ndarray) -> float:
@@ -55,9 +54,7 @@ def chamfer_m(first: np.ndarray, second: np.ndarray) -> float:
 
 def nearest_m(points: np.ndarray, queries: np.ndarray) -> np.ndarray:
     """The distance of each query (M, D) to the nearest of the points (N, D), shape (M,) [m]."""
-    from scipy.spatial import cKDTree
-
-    return cKDTree(points).query(queries)[0]
+    return scipy.spatial.cKDTree(points).query(queries)[0]
 
 
 def discrete_frechet_m(first: np.ndarray, second: np.ndarray) -> float:
@@ -123,11 +120,9 @@ class SurfaceCloud:
 
         Beyond r there is no point with the probability exp(-pi n r^2), and neighbours are 0.5 / sqrt(n) apart.
         """
-        from scipy.spatial import cKDTree
-
         if len(self.points) < 2:
             return 0.0
-        return GAP_SPACINGS * float(cKDTree(self.points).query(self.points, k=2)[0][:, 1].mean())
+        return GAP_SPACINGS * float(scipy.spatial.cKDTree(self.points).query(self.points, k=2)[0][:, 1].mean())
 
     def distance_m(self, queries: np.ndarray) -> np.ndarray:
         """Exact distances to the nearest triangle [m], (N, 3) to (N,)."""
@@ -147,14 +142,7 @@ def ray_spacing(directions: np.ndarray) -> np.ndarray:
         Chords of the unit sphere, shape (N,); infinite where fewer than three directions, or all on a line, have no
         triangles.
     """
-    found = _ray_spacing if len(directions) <= MOST_KEPT_RAYS else _ray_spacing.__wrapped__
-    return found(np.ascontiguousarray(directions, dtype=np.float64).tobytes()).copy()
-
-
-@lru_cache(maxsize=512)
-def _ray_spacing(directions: bytes) -> np.ndarray:
-    """`ray_spacing` of unit vectors as bytes, cached for rays that are fired in many scenes."""
-    distinct, inverse = np.unique(np.frombuffer(directions).reshape(-1, 3), axis=0, return_inverse=True)
+    distinct, inverse = np.unique(np.asarray(directions, dtype=np.float64), axis=0, return_inverse=True)
     spacing = np.full(len(distinct), np.inf)
     faces, seen = _delaunay_faces(distinct)
     if faces is not None:
@@ -217,14 +205,12 @@ def delaunay_surface(
 
 def _delaunay_faces(directions: np.ndarray) -> tuple[np.ndarray | None, np.ndarray]:
     """Delaunay triangles (F, 3) of the directions (N, 3) in a mask, and the mask; None where they span none."""
-    from scipy.spatial import Delaunay, QhullError
-
     if len(directions) < 3:
         return None, np.ones(len(directions), dtype=bool)
     plane, seen = _stereographic(directions)
     try:
-        return Delaunay(plane[seen]).simplices, seen
-    except QhullError:  # fewer than 3 points, or all of them collinear
+        return scipy.spatial.Delaunay(plane[seen]).simplices, seen
+    except scipy.spatial.QhullError:  # fewer than 3 points, or all of them collinear
         return None, seen
 
 

@@ -227,29 +227,6 @@ def silent_notes(scenes: Sequence[Scene], fired: Mapping[str, RaysPerCondition])
 
 
 @dataclass(frozen=True, eq=False)
-class ScenePass:
-    """Sets of rays to be scored in all held-out scenes.
-
-    Arguments:
-        task: The task that scores.
-        metric: Its metric.
-        seed: Root of the effects' random streams.
-        scenes: The held-out scenes.
-        fired: The sets of rays that are fired in a scene, by its number.
-        planner: How their effects are chosen.
-        plans: The plan of every scene where it is known already; empty: they are made.
-    """
-
-    task: Task
-    metric: Metric
-    seed: int
-    scenes: Sequence[Scene]
-    fired: Callable[[int], Sequence[RaysPerCondition]]
-    planner: Planner
-    plans: Sequence[EffectPlan] = ()
-
-
-@dataclass(frozen=True, eq=False)
 class SceneScores:
     """Scores of all sets of rays in a scene, and the effects that it was simulated with.
 
@@ -267,22 +244,36 @@ class SceneScores:
 
 
 def score_scenes(
-    scenes: ScenePass, progress: Progress | None = None, starmap: Starmap = itertools.starmap
+    task: Task,
+    metric: Metric,
+    seed: int,
+    scenes: Sequence[Scene],
+    fired: Callable[[int], Sequence[RaysPerCondition]],
+    planner: Planner,
+    plans: Sequence[EffectPlan] = (),
+    progress: Progress | None = None,
+    starmap: Starmap = itertools.starmap,
 ) -> list[SceneScores]:
     """Score scene by scene, so that only one scene's casters are held at a time; or by workers, to the same numbers.
 
     Arguments:
-        scenes: The scenes, the rays fired in each, and their effects.
+        task: The task that scores.
+        metric: Its metric.
+        seed: Root of the effects' random streams.
+        scenes: The scenes.
+        fired: The sets of rays that are fired in a scene, by its number.
+        planner: How their effects are chosen.
+        plans: The plan of every scene where it is known already; empty: they are made.
         progress: Called with the name of the scene, the scenes done, and all scenes.
         starmap: Map over scenes.
     """
-    found, total = [], len(scenes.scenes)
+    found, total = [], len(scenes)
     asked = (
-        (scenes.task, scenes.metric, scene, list(scenes.fired(n)), scenes.planner, plan, scenes.seed)
-        for n, (scene, plan) in enumerate(zip(scenes.scenes, scenes.plans or [None] * total, strict=True))
+        (task, metric, scene, list(fired(number)), planner, plan, seed)
+        for number, (scene, plan) in enumerate(zip(scenes, plans or [None] * total, strict=True))
     )
     results = iter(starmap(score_in_scene, asked))
-    for number, scene in enumerate(scenes.scenes):
+    for number, scene in enumerate(scenes):
         if progress:
             progress(scene.name, number, total)
         found.append(next(results))

@@ -49,20 +49,6 @@ class PatternRule:
         """The patterns of many features (U, F), (U,)."""
         return np.array([self.pattern_of(one) for one in features], dtype=np.intp)
 
-    def check_features(self, features: np.ndarray) -> None:
-        """Refuse another number of features than the rule has.
-
-        Raises:
-            DataError: Another number.
-        """
-        if len(features) != self.centroids.shape[1]:
-            raise DataError(
-                f"the task gives {len(features)} features of returns, the rule of the design has "
-                f"{self.centroids.shape[1]}",
-                where="adaptive.centroids",
-                hint="fit the design again",
-            )
-
     def ranges(self, range_m: np.ndarray) -> np.ndarray:
         """The features of ranges of the first look, (..., looks) [m]; not a number where every ray misses."""
         silent = np.isnan(range_m).all(axis=-1, keepdims=True)
@@ -118,35 +104,37 @@ class AdaptiveRays(tuple[Rays, ...]):
         """Its parts, for workers."""
         return tuple(self), self.rule, self.shares, self.features
 
-    def mapped(self, change: Callable[[Rays], Rays]) -> AdaptiveRays:
-        """The same after a change of the rays of each pattern."""
-        return AdaptiveRays(map(change, self), self.rule, self.shares, self.features)
-
     def fired(self, scene: Scene, returns: Sequence[Sequence[Returns]]) -> list[int]:
         """The pattern that fires in each frame.
 
         Arguments:
             scene: The scene.
             returns: What each pattern returns in every frame.
+
+        Raises:
+            DataError: The task gives another number of features than the rule has.
         """
-        found, features = [], None
+        found, features, wanted = [], None, self.rule.centroids.shape[1]
         for frame in range(len(returns[UNKNOWN])):
             if self.rule.looks:
                 features = self.rule.ranges(returns[UNKNOWN][frame].range_m[: self.rule.looks])
             elif self.features is not None and found:
                 features = self.features(scene, returns[found[-1]][frame - 1])
-                self.rule.check_features(features)
+                if len(features) != wanted:
+                    raise DataError(
+                        f"the task gives {len(features)} features of returns, the rule of the design has {wanted}",
+                        where="adaptive.centroids",
+                        hint="fit the design again",
+                    )
             found.append(UNKNOWN if features is None else self.rule.pattern_of(features))
         return found
-
-    def followed(self, scene: Scene, returns: Sequence[Sequence[Returns]]) -> list[Returns]:
-        """The returns of the patterns that fire, one entry per frame; arguments as of `fired`."""
-        return [returns[pattern][frame] for frame, pattern in enumerate(self.fired(scene, returns))]
 
 
 def mapped(positions: tuple[Rays, ...], change: Callable[[Rays], Rays]) -> tuple[Rays, ...]:
     """Rays at condition values, or of patterns, after a change of each."""
-    return positions.mapped(change) if isinstance(positions, AdaptiveRays) else tuple(map(change, positions))
+    if isinstance(positions, AdaptiveRays):
+        return AdaptiveRays(map(change, positions), positions.rule, positions.shares, positions.features)
+    return tuple(map(change, positions))
 
 
 def mean_mbps(positions: Sequence[Rays], bandwidth: Bandwidth) -> float:
@@ -166,5 +154,5 @@ def returns_of(positions: Sequence[Rays], scene: Scene, returns: Sequence[Sequen
         returns: Of each list of rays in every frame.
     """
     if isinstance(positions, AdaptiveRays):
-        return positions.followed(scene, returns)
+        return [returns[pattern][frame] for frame, pattern in enumerate(positions.fired(scene, returns))]
     return [frame for frames in returns for frame in frames]

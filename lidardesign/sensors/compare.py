@@ -7,7 +7,7 @@ where a metre of place and of gate counts as much as a radian at the designs' ra
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -24,50 +24,38 @@ FAR_SIZES = 10.0
 MODEL_KEYS = ("bin_ps", "bits_per_bin", "rate_hz")
 
 
-@dataclass(frozen=True, eq=False)
-class SensorPair:
-    """A sensor of each of two designs; one is None where the other design has more.
-
-    Arguments:
-        first, second: The sensors of the first and the second design.
-    """
-
-    first: Sensor | None
-    second: Sensor | None
-
-    def as_dict(self) -> dict[str, Any]:
-        """Names and the differences, second minus first: metres, degrees and shares; None for a sensor left over."""
-        named = {"a": self.first.name if self.first else None, "b": self.second.name if self.second else None}
-        if self.first is None or self.second is None:
-            return {**named, "difference": None}
-        first, second = self.first, self.second
-        fields = np.degrees(np.subtract(second.field_of_view_rad, first.field_of_view_rad))
-        gates = np.subtract(second.gate_m, first.gate_m)
-        return {
-            **named,
-            "difference": {
-                "place_m": float(np.linalg.norm(second.origin_m - first.origin_m)),
-                "boresight_deg": math.degrees(angle_between(first.boresight, second.boresight)),
-                "roll_deg": math.degrees(math.remainder(second.roll_rad - first.roll_rad, math.tau)),
-                "horizontal_deg": float(fields[0]),
-                "vertical_deg": float(fields[1]),
-                "gate_start_m": float(gates[0]),
-                "gate_end_m": float(gates[1]),
-                "weight": second.weight - first.weight,
-            },
-        }
+def difference(first: Sensor | None, second: Sensor | None) -> dict[str, Any]:
+    """Names and the differences, second minus first: metres, degrees and shares; None for a sensor left over."""
+    named = {"a": first.name if first else None, "b": second.name if second else None}
+    if first is None or second is None:
+        return {**named, "difference": None}
+    fields = np.degrees(np.subtract(second.field_of_view_rad, first.field_of_view_rad))
+    gates = np.subtract(second.gate_m, first.gate_m)
+    return {
+        **named,
+        "difference": {
+            "place_m": float(np.linalg.norm(second.origin_m - first.origin_m)),
+            "boresight_deg": math.degrees(angles_between(first.boresight, second.boresight)),
+            "roll_deg": math.degrees(math.remainder(second.roll_rad - first.roll_rad, math.tau)),
+            "horizontal_deg": float(fields[0]),
+            "vertical_deg": float(fields[1]),
+            "gate_start_m": float(gates[0]),
+            "gate_end_m": float(gates[1]),
+            "weight": second.weight - first.weight,
+        },
+    }
 
 
-def angle_between(first: np.ndarray, second: np.ndarray) -> float:
-    """The angle of two unit vectors (3,), exact for the smallest too [rad]."""
-    return 2 * math.atan2(float(np.linalg.norm(first - second)), float(np.linalg.norm(first + second)))
+def angles_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Angles between unit vectors (..., 3), exact for the smallest too, shape (...) [rad]."""
+    return 2 * np.arctan2(np.linalg.norm(first - second, axis=-1), np.linalg.norm(first + second, axis=-1))
 
 
-def paired_sensors(first: DesignSpec, second: DesignSpec) -> list[SensorPair]:
-    """The sensors of two designs in pairs, in the order of the first; those left over at the end."""
+def paired_sensors(first: DesignSpec, second: DesignSpec) -> list[tuple[Sensor | None, Sensor | None]]:
+    """The sensors of two designs in pairs, in the order of the first; those left over, with None, at the end."""
     by_name = {sensor.name: sensor for sensor in second.sensors}
     if {sensor.name for sensor in first.sensors} == set(by_name):
-        return [SensorPair(sensor, by_name[sensor.name]) for sensor in first.sensors]
+        return [(sensor, by_name[sensor.name]) for sensor in first.sensors]
     from scipy.optimize import linear_sum_assignment
 
     range_m = float(np.mean([sensor.gate_m for sensor in (*first.sensors, *second.sensors)])) or RIGHT_ANGLE_M
@@ -83,9 +71,9 @@ def paired_sensors(first: DesignSpec, second: DesignSpec) -> list[SensorPair]:
     # the difference of each sensor of one design from each of the other, shape (G, H) [m]
     distances_m = sum(np.linalg.norm(one[key][:, None] - other[key][None], axis=2) for key in one)
     rows, columns = linear_sum_assignment(distances_m)
-    pairs = [SensorPair(first.sensors[row], second.sensors[column]) for row, column in zip(rows, columns, strict=True)]
-    pairs += [SensorPair(sensor, None) for index, sensor in enumerate(first.sensors) if index not in rows]
-    return pairs + [SensorPair(None, sensor) for index, sensor in enumerate(second.sensors) if index not in columns]
+    pairs = [(first.sensors[row], second.sensors[column]) for row, column in zip(rows, columns, strict=True)]
+    pairs += [(sensor, None) for index, sensor in enumerate(first.sensors) if index not in rows]
+    return pairs + [(None, sensor) for index, sensor in enumerate(second.sensors) if index not in columns]
 
 
 @dataclass(frozen=True)
@@ -106,9 +94,8 @@ class BandwidthUse:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for scripts."""
-        model = {name: getattr(self.model, name) for name in MODEL_KEYS}
         rays = {"rays": self.rays, "of_one_ray": self.rays is None}
-        return {"low_mbps": self.low_mbps, "high_mbps": self.high_mbps, **rays, **model}
+        return {"low_mbps": self.low_mbps, "high_mbps": self.high_mbps, **rays, **asdict(self.model)}
 
 
 def readout_of(design: DesignSpec) -> BandwidthUse:
@@ -136,16 +123,14 @@ def outside_notes(design: DesignSpec, space: DesignSpace) -> list[str]:
     """
     low, high = np.array(space.low[:3]), np.array(space.high[:3])
     size_m = float(np.linalg.norm(high - low)) + space.high[RANGE]
-    origins_m = np.array([sensor.origin_m for sensor in design.sensors]).reshape(-1, 3)
-    starts_m = np.array([sensor.gate_m[0] for sensor in design.sensors])
-    for pattern in design.patterns:
-        origins_m = np.concatenate([origins_m, pattern.origin_m.reshape(-1, 3)])
-        starts_m = np.concatenate([starts_m, pattern.gate_m[..., 0].reshape(-1)])
+    every = (*design.sensors, *design.patterns)
+    origins_m = np.concatenate([np.reshape(one.origin_m, (-1, 3)) for one in every])
+    starts_m = np.concatenate([np.asarray(one.gate_m)[..., 0].ravel() for one in every])
     unit = "are its lengths in millimetres?"
     apart_m = np.linalg.norm(np.maximum(np.maximum(origins_m - high, low - origins_m), 0.0), axis=1)
-    if len(apart_m) and apart_m.max() > FAR_SIZES * size_m:
+    if apart_m.max() > FAR_SIZES * size_m:
         return [f"{design.name} stands {apart_m.max():.4g} m outside the run's design space; {unit}"]
-    if len(starts_m) and starts_m.max() > FAR_SIZES * size_m:
+    if starts_m.max() > FAR_SIZES * size_m:
         return [
             f"{design.name} listens from {starts_m.max():.4g} m, but the run's design space ends at "
             f"{space.high[RANGE]:.4g} m; {unit}"

@@ -119,18 +119,12 @@ class DesignSpec:
         """Rays of each sensor in its largest pattern, shape (S,)."""
         return self.patterns[-1].per_sensor(len(self.sensors))
 
-    def rays(
-        self,
-        count: int | None = None,
-        at: Mapping[str, float] | None = None,
-        rate_hz: float = DEFAULT_RATE_HZ,
-    ) -> Rays:
+    def rays(self, count: int | None = None, at: Mapping[str, float] | None = None) -> Rays:
         """The rays that it fires, evenly over a frame: the one source of a design's rays.
 
         Arguments:
             count: Rays per frame; None takes its own number.
             at: Condition values, as {"x_m": 0.37}: patterns along a condition are evaluated, others are moved.
-            rate_hz: Frames per second [Hz].
 
         Raises:
             ConfigError: It cannot fire so many rays, has no number of its own, or cannot be at this condition.
@@ -139,17 +133,13 @@ class DesignSpec:
         if count is None:
             raise ConfigError("the design names no number of rays", where=self.name, hint="give --rays N")
         here = self.at_condition(at or {}) if at or self.condition else self
-        rays = here._rays(count)
-        return rays if rate_hz == DEFAULT_RATE_HZ else replace(rays, time_s=fire_times(len(rays), rate_hz))
-
-    def _rays(self, count: int) -> Rays:
-        pattern = self.pattern(count)
+        pattern = here.pattern(count)
         if pattern is not None:
             return pattern.at()
         if self.layout == "even":
-            return even_rays(self.sensors, split_budget(self.weights, count, each=True))
+            return even_rays(here.sensors, split_budget(self.weights, count, each=True))
         if self.size is not None and count <= self.size:
-            table = self.patterns[-1].at()
+            table = here.patterns[-1].at()
             shares = split_budget(self._own_counts, count)
             own = [np.flatnonzero(table.sensor == index) for index in range(len(shares))]
             chosen = [rows[even_subset(table.direction[rows], int(n))] for rows, n in zip(own, shares, strict=True)]
@@ -203,17 +193,6 @@ class DesignSpec:
         Raises:
             ConfigError: A name that is no coordinate, a value beyond the ends of a pattern, or none where rays differ.
         """
-        moves, here = self._moves(at), {**self.at, **at}
-        sensors = tuple(replace(sensor, origin_m=with_coordinates(sensor.origin_m, moves)) for sensor in self.sensors)
-        if self.condition is None:
-            patterns = tuple(pattern.moved(moves) for pattern in self.patterns)
-        else:
-            patterns = tuple(Pattern.of(pattern.at(at.get(self.condition))) for pattern in self.patterns)
-        kept = self.certificates if here == self.at or self.condition is not None else ()
-        return replace(self, sensors=sensors, patterns=patterns, at=here, certificates=kept)
-
-    def _moves(self, at: Mapping[str, float]) -> dict[int, float]:
-        """The new coordinates of origins by axis; conditions other than origins cannot change."""
         for name, value in at.items():
             if name not in DIMENSIONS:
                 raise ConfigError(
@@ -229,7 +208,17 @@ class DesignSpec:
                     allowed=f"{name}={self.at[name]:g}" if name in self.at else ", ".join(allowed),
                     hint=f"lidardesign fit RUN --at {name}={value:g}",
                 )
-        return {DIMENSIONS.index(name): float(value) for name, value in at.items() if name in TRAVELLED}
+        here = {**self.at, **at}
+        moves = {DIMENSIONS.index(name): float(value) for name, value in at.items() if name in TRAVELLED}
+        sensors = tuple(replace(sensor, origin_m=with_coordinates(sensor.origin_m, moves)) for sensor in self.sensors)
+        if self.condition is None:
+            patterns = tuple(
+                replace(pattern, origin_m=with_coordinates(pattern.origin_m, moves)) for pattern in self.patterns
+            )
+        else:
+            patterns = tuple(Pattern.of(pattern.at(at.get(self.condition))) for pattern in self.patterns)
+        kept = self.certificates if here == self.at or self.condition is not None else ()
+        return replace(self, sensors=sensors, patterns=patterns, at=here, certificates=kept)
 
 
 # A bound that leaves more of the loss open than this certifies nothing that anyone would act on.

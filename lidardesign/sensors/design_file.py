@@ -17,8 +17,8 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validat
 from lidardesign.errors import ConfigError, page
 from lidardesign.numerics import COARSE_SLACK, SLACK
 from lidardesign.run.files import write_atomic
-from lidardesign.run.validation import check_model, is_name
-from lidardesign.run.yaml import KeyPath, dump_yaml
+from lidardesign.run.validation import check_model, is_name, placed_at
+from lidardesign.run.yaml import dump_yaml
 from lidardesign.sensors.adaptive import AdaptivePatterns, PatternRule
 from lidardesign.sensors.design import DesignSpec, LayoutName
 from lidardesign.sensors.pattern import Pattern
@@ -181,16 +181,12 @@ class AdaptiveEntry(_Keys):
             raise ValueError("centroids need one number per feature, or with a first look one per ray of it")
         if len(self.missing_m) != self.looks or self.looks > min(rays):
             raise ValueError("missing_m needs a range for each ray of the first look, which every pattern begins with")
-        for name in (*COLUMNS, "sensor"):
-            begun = [row[: self.looks] for row in (_only_row(pattern, name) for pattern in self.patterns)]
-            if any(one != begun[0] for one in begun):
+        rows = {name: [getattr(pattern, name)[0] for pattern in self.patterns] for name in COLUMNS}
+        rows["sensor"] = [pattern.sensor for pattern in self.patterns]
+        for name, own in rows.items():
+            if any(row[: self.looks] != own[0][: self.looks] for row in own):
                 raise ValueError(f"patterns differ in {name} of the first look")
         return self
-
-
-def _only_row(pattern: PatternEntry, name: str) -> list[Any]:
-    column = getattr(pattern, name)
-    return column if name == "sensor" else column[0]
 
 
 class DesignFile(_Keys):
@@ -337,11 +333,7 @@ def design_from_document(document: Any, where: str = "design", locate: Callable[
     Raises:
         ConfigError: A key is missing, unknown, of the wrong kind, or contradicts another.
     """
-
-    def named(path: KeyPath, *, key: bool = False) -> str:
-        return where
-
-    locate = locate or named
+    locate = locate or placed_at(where)
     if not isinstance(document, dict) or "sensors" not in document:
         raise ConfigError(
             "this is not a design: it has no key `sensors`",
@@ -357,17 +349,11 @@ def design_from_document(document: Any, where: str = "design", locate: Callable[
             allowed=f"schema_version: {SCHEMA_VERSION}",
             hint="fit it again: lidardesign fit RUN" if older else "use that version",
         )
-    return _design(check_model(DesignFile, without_nulls(document), locate), Path(where).stem)
-
-
-def without_nulls(value: Any) -> Any:
-    """A mapping without keys of null: an optional key that is null counts as absent."""
-    return {key: item for key, item in value.items() if item is not None} if isinstance(value, Mapping) else value
-
-
-def _design(file: DesignFile, stem: str) -> DesignSpec:
+    # an optional key that is null counts as absent
+    given = {key: value for key, value in document.items() if value is not None}
+    file = check_model(DesignFile, given, locate)
     return DesignSpec(
-        name=file.name or stem,
+        name=file.name or Path(where).stem,
         sensors=tuple(_sensors(file.sensors)),
         layout=file.layout,
         patterns=tuple(map(_pattern, file.patterns)),

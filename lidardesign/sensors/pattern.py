@@ -22,8 +22,8 @@ from lidardesign.space import DIMENSIONS, angles, direction
 
 # Conditions that a sensor can travel along: where a ray starts, not where it looks.
 TRAVELLED = DIMENSIONS[:3]
-# Of low-discrepancy points: so many axes have an additive recurrence, more of them the first primes.
-RECURRENCE_AXES, PRIMES = 2, (2, 3, 5, 7, 11, 13)
+# Of low-discrepancy points: so many axes have an additive recurrence.
+RECURRENCE_AXES = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +65,9 @@ class Pattern:
             lists: The rays at each knot, equal numbers of each sensor.
             ends: First and last value of the pattern, which enclose the knots.
         """
+        # slow to import
+        from scipy.optimize import linear_sum_assignment
+
         order = np.argsort(knots)
         rays = [lists[order[0]]]
         for place in order[1:]:
@@ -73,7 +76,8 @@ class Pattern:
             taken = np.empty(len(before), dtype=np.intp)
             for sensor in np.unique(before):
                 mine, theirs = np.flatnonzero(before == sensor), np.flatnonzero(after == sensor)
-                taken[mine] = theirs[_assigned(aims[0][mine], aims[1][theirs])]
+                moves = np.square(aims[0][mine][:, None] - aims[1][theirs][None]).sum(axis=2)
+                taken[mine] = theirs[linear_sum_assignment(moves)[1]]
             rays.append(lists[place].subset(taken))
         places = np.array(knots, dtype=np.float64)[order].tolist()
         if ends[0] < places[0]:
@@ -157,10 +161,6 @@ class Pattern:
         azimuth[:, own], elevation[:, own] = (one.reshape(places, -1) for one in found)
         return replace(self, origin_m=origin_m, azimuth_rad=np.unwrap(azimuth, axis=0), elevation_rad=elevation)
 
-    def moved(self, values: Mapping[int, float]) -> Pattern:
-        """The pattern with given coordinates of all origins, by axis [m]."""
-        return replace(self, origin_m=with_coordinates(self.origin_m, values))
-
 
 def with_coordinates(origin_m: np.ndarray, values: Mapping[int, float]) -> np.ndarray:
     """Origins (..., 3) with given coordinates, by axis [m]."""
@@ -168,14 +168,6 @@ def with_coordinates(origin_m: np.ndarray, values: Mapping[int, float]) -> np.nd
     for axis, value in values.items():
         moved[..., axis] = value
     return moved
-
-
-def _assigned(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """The index in `after` (N, 3) of each point of `before` (N, 3), with the least sum of squared moves."""
-    # slow to import
-    from scipy.optimize import linear_sum_assignment
-
-    return linear_sum_assignment(np.square(before[:, None] - after[None]).sum(axis=2))[1]
 
 
 def even_rays(sensors: Sequence[Sensor], counts: Sequence[int]) -> Rays:
@@ -240,7 +232,7 @@ def _row_count(horizontal_rad: float, vertical_rad: float, count: int) -> int:
 
 
 def low_discrepancy(count: int, axes: int) -> np.ndarray:
-    """Points that fill the unit cube evenly, shape (count, axes), axes <= 6.
+    """Points that fill the unit cube evenly, shape (count, axes).
 
     Up to two axes the additive recurrence R_k (M. Roberts 2018): its generators are the powers of 1 / phi, with phi
     the root of phi^(k+1) = phi + 1 above 1. Beyond, small multiples of two generators nearly add up to a whole number,
@@ -249,7 +241,10 @@ def low_discrepancy(count: int, axes: int) -> np.ndarray:
     the most even: they go to the last axes, which are those of directions.
     """
     if axes > RECURRENCE_AXES:
-        return np.stack([_radical_inverse(count, base) for base in PRIMES[axes - 1 :: -1]], axis=1)
+        # slow to import
+        from scipy.stats.qmc import Halton
+
+        return Halton(axes, scramble=False).fast_forward(1).random(count)[:, ::-1]
     phi = 1.5
     for _ in range(64):  # a contraction by at least 3: 64 steps are far below rounding
         phi = (1.0 + phi) ** (1.0 / (axes + 1))
@@ -257,27 +252,12 @@ def low_discrepancy(count: int, axes: int) -> np.ndarray:
     return np.mod(0.5 + np.arange(1, count + 1)[:, None] * generators, 1.0)
 
 
-def _radical_inverse(count: int, base: int) -> np.ndarray:
-    """The radical inverse of 1 to `count` in a base: their digits mirrored at the point, shape (count,)."""
-    left, place, total = np.arange(1, count + 1), 1.0, np.zeros(count)
-    while left.any():
-        place /= base
-        left, digit = np.divmod(left, base)
-        total += place * digit
-    return total
-
-
 def even_subset(points: np.ndarray, count: int) -> np.ndarray:
     """Indices, ascending, of `count` of the points that lie evenly among them: (M, K) to int64 (count,).
 
     The points are halved along their longest extent until as many groups as wanted are left, each with the same
     number of points but for one; of each the point nearest to its centre stays. Deterministic, and O(M log M).
-
-    Raises:
-        ConfigError: `count` exceeds the number of points.
     """
-    if not 0 <= count <= len(points):
-        raise ConfigError(f"{count} of {len(points)} rays", where="rays", allowed=f"0 to {len(points)}")
     if count == len(points):
         return np.arange(count)
     kept: list[int] = []

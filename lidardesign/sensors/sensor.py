@@ -33,19 +33,21 @@ def interval_factor(level: float) -> float:
     return NormalDist().inv_cdf((1 + level) / 2)
 
 
-def boresight_frame(azimuth_rad: float, elevation_rad: float, roll_rad: float = 0.0) -> np.ndarray:
-    """Rows forward, horizontal, vertical of a boresight, shape (3, 3).
+def boresight_frame(
+    azimuth_rad: float | np.ndarray, elevation_rad: float | np.ndarray, roll_rad: float | np.ndarray = 0.0
+) -> np.ndarray:
+    """Rows forward, horizontal, vertical of boresights, (...) each to (..., 3, 3).
 
     Horizontal is the direction of growing azimuth, vertical that of growing elevation, both turned by the
     roll about the boresight (right-handed). At the poles the azimuth fixes the frame, so it stays defined.
     """
-    sin_a, cos_a = math.sin(azimuth_rad), math.cos(azimuth_rad)
-    sin_e, cos_e = math.sin(elevation_rad), math.cos(elevation_rad)
-    forward = np.array([cos_e * cos_a, cos_e * sin_a, sin_e])
-    horizontal = np.array([-sin_a, cos_a, 0.0])
-    vertical = np.array([-sin_e * cos_a, -sin_e * sin_a, cos_e])
-    sin_r, cos_r = math.sin(roll_rad), math.cos(roll_rad)
-    return np.stack([forward, cos_r * horizontal + sin_r * vertical, cos_r * vertical - sin_r * horizontal])
+    sin_a, cos_a = np.sin(azimuth_rad), np.cos(azimuth_rad)
+    sin_e, cos_e = np.sin(elevation_rad), np.cos(elevation_rad)
+    sin_r, cos_r = np.sin(roll_rad)[..., None], np.cos(roll_rad)[..., None]
+    forward = np.stack([cos_e * cos_a, cos_e * sin_a, sin_e], axis=-1)
+    horizontal = np.stack([-sin_a, cos_a, np.zeros_like(sin_a)], axis=-1)
+    vertical = np.stack([-sin_e * cos_a, -sin_e * sin_a, cos_e], axis=-1)
+    return np.stack([forward, cos_r * horizontal + sin_r * vertical, cos_r * vertical - sin_r * horizontal], axis=-2)
 
 
 def boresight_of(frame: np.ndarray) -> tuple[float, float, float]:

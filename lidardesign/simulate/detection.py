@@ -28,6 +28,7 @@ from lidardesign.simulate.detector.physics import (
     Physics,
     bins_of,
     check_windows,
+    chunks,
     metres,
     resolution_m,
 )
@@ -45,19 +46,6 @@ FIRST_BIN = 1 << 40
 EXPLAINED_SIGMAS = 3.0
 
 
-@dataclass(frozen=True, eq=False)
-class Detections:
-    """Detected half paths and bodies of N rays.
-
-    Arguments:
-        path_m: Half the whole path, NaN without a return, shape (N,) [m].
-        body: Index of the echo's body, -1 for false alarms and without a return, shape (N,).
-    """
-
-    path_m: np.ndarray
-    body: np.ndarray
-
-
 def detect(
     scene: Scene,
     frame: int,
@@ -66,8 +54,12 @@ def detect(
     echoes: Echoes,
     background: Background,
     physics: Physics,
-) -> Detections:
+) -> tuple[np.ndarray, np.ndarray]:
     """Detect the returns of all rays of a frame; those of a sensor share its emitter's light.
+
+    Returns:
+        Half the whole path, NaN without a return, and the index of the echo's body, -1 for false alarms and without a
+        return; shapes (N,) [m] and (N,).
 
     Arguments:
         scene, frame: They name the random streams.
@@ -85,7 +77,7 @@ def detect(
         return _strongest(scene, frame, windows_m, echoes, physics)
     path_m = np.full(len(windows_m), np.nan)
     light = ArrivingLight.of(rays, windows_m, echoes, background, physics)
-    for begin, end in light.bins.chunks():
+    for begin, end in chunks(light.bins.offset):
         path_m[begin:end] = _from_photons(scene, frame, light.part(begin, end), physics)
     # The body of the strongest echo near each detected half path, -1 where there is none
     tolerance = EXPLAINED_SIGMAS * metres(physics.detector.timing_sigma_s) + light.bins.width_m / 2
@@ -94,7 +86,7 @@ def detect(
     rising = near[np.argsort(echoes.gain[near], kind="stable")]
     body = np.full(len(windows_m), -1)
     body[echoes.ray[rising]] = echoes.body[rising]
-    return Detections(path_m, body)
+    return path_m, body
 
 
 def _from_photons(scene: Scene, frame: int, light: ArrivingLight, physics: Physics) -> np.ndarray:
@@ -131,7 +123,9 @@ def _known_level(light: ArrivingLight, physics: Physics) -> np.ndarray:
     return light.pulses * arriving / (1 + light.per_metre * metres(detector.photons.dead_s))
 
 
-def _strongest(scene: Scene, frame: int, windows_m: np.ndarray, echoes: Echoes, physics: Physics) -> Detections:
+def _strongest(
+    scene: Scene, frame: int, windows_m: np.ndarray, echoes: Echoes, physics: Physics
+) -> tuple[np.ndarray, np.ndarray]:
     """The strongest echo in each window, averaged by gain with the echoes within the detector's resolution."""
     count, detector = len(windows_m), physics.detector
     inside = (echoes.path_m >= windows_m[echoes.ray, 0]) & (echoes.path_m < windows_m[echoes.ray, 1])
@@ -157,7 +151,7 @@ def _strongest(scene: Scene, frame: int, windows_m: np.ndarray, echoes: Echoes, 
         path_m = np.clip(path_m, windows_m[:, 0], np.nextafter(windows_m[:, 1], windows_m[:, 0]))
     if "quantisation" in physics.effects:
         path_m = round_to_bins(path_m, windows_m, detector)
-    return Detections(path_m, body)
+    return path_m, body
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,7 +3,7 @@
 Each effect's `bound` (`simulate.effects`) is an upper bound of its change. The smallest are skipped while their sum
 stays within a tolerance: errors of range add up in the worst case, and so do shares of returns. The tolerance holds for
 reported returns, with rounding and photon noise, ray by ray with the same random numbers (`add_quantisation_bounds`;
-tests/soak/promise.py tests it). Effects that are absent from a scene are ruled out without casting a ray.
+benchmarks/soak/promise.py tests it). Effects that are absent from a scene are ruled out without casting a ray.
 
 The time of an effect is predicted per ray and frame, as measured on one core (2.5 GHz) with a face of 20,000 triangles,
 some hundred photons per ray and a gate of 1 m, each effect added to photon noise alone. Elsewhere the relation between
@@ -238,15 +238,7 @@ class Planner:
         for rays in lists:
             check_windows(path_windows(rays, scene.receiver), self.detector)
         found = _bounds(scene, lists, self.detector, casters)
-        rays = sum(len(rays) for rays in lists) * scene.frames
-        return self._decided(found, {name: predicted_seconds(name, self.detector, rays) for name in EFFECTS})
-
-    def chosen_from(self, plan: EffectPlan) -> EffectPlan:
-        """Choose again from the bounds in another planner's plan of the same rays, with the same detector."""
-        found = {decision.name: decision.bound for decision in plan.decisions}
-        return self._decided(found, {decision.name: decision.seconds for decision in plan.decisions})
-
-    def _decided(self, found: dict[str, Bound], seconds: dict[str, float]) -> EffectPlan:
+        count = sum(len(rays) for rays in lists) * scene.frames
         if self.choice == "auto":
             wanted = _called_for(found, self.tolerated)
             if self.detector.photons is not None and wanted & SEVERAL_ECHOES and not wanted & COUNTED:
@@ -261,6 +253,7 @@ class Planner:
             if reason is not None and isinstance(self.choice, frozenset):
                 raise ConfigError(f"{name} cannot be simulated here: {reason}", where="--effects", hint="leave it out")
         on = {name for name, reason in missing.items() if reason is None}
+        seconds = {name: predicted_seconds(name, self.detector, count) for name in EFFECTS}
         decisions = (Decision(name, name in on, found[name], seconds[name], missing.get(name)) for name in EFFECTS)
         return EffectPlan(tuple(decisions), self.tolerated)
 

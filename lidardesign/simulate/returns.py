@@ -23,7 +23,7 @@ from lidardesign.scenes.casting import SceneCaster, checked_rays, first_hits
 from lidardesign.scenes.rays import Hits, Outcome, Rays, Returns, gate_outcomes, path_windows, range_of_path
 from lidardesign.scenes.scene import Scene
 from lidardesign.simulate.detector.light import Background, Beams, Echoes, direct_echoes
-from lidardesign.simulate.detector.physics import Physics, check_windows
+from lidardesign.simulate.detector.physics import Physics, check_windows, chunks
 from lidardesign.simulate.effects.ambient import add_ambient
 from lidardesign.simulate.effects.atmosphere import through_air
 from lidardesign.simulate.effects.footprint import split_beams
@@ -128,16 +128,16 @@ def measure(scene: Scene, frame: int, rays: Rays, caster: SceneCaster, physics: 
     from lidardesign.simulate.detection import detect
 
     light = followed_light(scene, frame, rays, caster, physics)
-    found = detect(scene, frame, rays, light.windows_m, light.echoes, light.background, physics)
+    path_m, body = detect(scene, frame, rays, light.windows_m, light.echoes, light.background, physics)
     # rays without a return keep the outcome of their geometry, or were not detected
     first = np.full(len(rays), np.inf)
     np.minimum.at(first, light.beams.ray, light.hits.range_m)
     outcome = gate_outcomes(first, rays.gate_m)
     outcome[outcome == Outcome.RETURN] = Outcome.NOT_DETECTED
-    range_m = range_of_path(rays, scene.receiver, found.path_m)
+    range_m = range_of_path(rays, scene.receiver, path_m)
     detected = np.isfinite(range_m)
     outcome[detected] = Outcome.RETURN
-    return Returns(rays, outcome, range_m, np.where(detected, found.body, -1), frame=frame)
+    return Returns(rays, outcome, range_m, np.where(detected, body, -1), frame=frame)
 
 
 class FollowedLight(NamedTuple):
@@ -222,7 +222,7 @@ def photon_histograms(scene: Scene, frame: int, rays: Rays, caster: SceneCaster,
     whole = ArrivingLight.of(rays, light.windows_m, light.echoes, light.background, physics)
     number = np.diff(whole.bins.offset)
     counts = np.zeros((len(rays), number.max(initial=0)), np.int64)
-    for begin, end in whole.bins.chunks():
+    for begin, end in chunks(whole.bins.offset):
         filled = np.arange(counts.shape[1]) < number[begin:end, None]
         counts[begin:end][filled] = count_photons(scene, frame, whole.part(begin, end), physics)
     return PhotonHistograms(whole.bins.first_m, whole.bins.width_m, number, counts, whole.pulses)

@@ -76,18 +76,17 @@ def swap(folder):
     second.write_bytes(content[0])
 
 
-@pytest.mark.parametrize(
-    ("change", "named"),
-    [
-        (lambda folder: None, None),
-        (lambda folder: (folder / "notes.txt").write_text("no mesh"), None),
-        (come, "a.stl, dd.stl, z.stl"),
-        (renumber, "c.stl"),
-        (swap, None),
-        (lambda folder: shutil.copy(folder / "c.stl", folder / "copy.stl"), "copy.stl"),
-    ],
-    ids=["nothing", "other files", "new ones", "renumbered", "swapped", "a copy"],
-)
+CHANGES = {
+    "nothing": (lambda folder: None, None),
+    "other files": (lambda folder: (folder / "notes.txt").write_text("no mesh"), None),
+    "new ones": (come, "a.stl, dd.stl, z.stl"),
+    "renumbered": (renumber, "c.stl"),
+    "swapped": (swap, None),
+    "a copy": (lambda folder: shutil.copy(folder / "c.stl", folder / "copy.stl"), "copy.stl"),
+}
+
+
+@pytest.mark.parametrize(("change", "named"), CHANGES.values(), ids=CHANGES)
 def test_scenes_are_those_that_were_learned_and_newcomers_are_named(place, change, named):
     run = ld.open_run(place / "run")
     before, metric = splits(run), run.metric

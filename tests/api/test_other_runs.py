@@ -11,7 +11,6 @@ import pytest
 from support.command_line import make_run
 
 import lidardesign as package
-from lidardesign.config import load_run_config, save_run_config, with_task_settings
 from lidardesign.errors import ConfigError
 from lidardesign.formats.designs import load_design
 from lidardesign.scenes.rays import Rays
@@ -20,27 +19,18 @@ from lidardesign.sensors.compare import outside_space
 from lidardesign.sensors.pattern import Pattern
 from lidardesign.space import DIMENSIONS, direction
 
-LAYOUTS = ("even", "chosen")
-OPTIONS = {"rays": [8], "baselines": ["lloyd", "occupancy", "no-visibility"]}
-
-
-def learned_elsewhere(folder, seed=5):
-    """A run of flatter curves, and fewer scenes."""
-    make_run(folder, seed=seed)
-    task, config = load_run_config(folder)
-    (folder / "config.yaml").unlink()
-    save_run_config(with_task_settings(task, config, ["variation=0.5", "train=12", "test=12"]), folder)
-    return folder
+# Layouts, and further baselines that they are scored beside.
+LAYOUTS = {"even": ["lloyd", "no-visibility"], "chosen": ["occupancy"]}
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     """A run with a design of each layout, and a run of other scenes without any."""
     folder = tmp_path_factory.mktemp("runs")
-    run = package.open_run(make_run(folder / "own", seed=4))
+    run = package.open_run(make_run(folder / "own", seed=4, overrides=["test=5"]))
     for layout in LAYOUTS:
         run.fit(layout=layout, sensors=2, rays=8, name=layout).save()
-    learned_elsewhere(folder / "other")
+    make_run(folder / "other", seed=5, overrides=["variation=0.5", "train=12", "test=5"])
     return folder
 
 
@@ -58,14 +48,14 @@ def without_times(scores):
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_scores_are_those_of_a_run_that_was_learned_there(runs, layout):
     own, other = runs
-    design = own / "designs" / f"{layout}.yaml"
-    there = package.open_run(other).evaluate([design], **OPTIONS)
+    design, options = own / "designs" / f"{layout}.yaml", {"rays": [8], "baselines": LAYOUTS[layout]}
+    there = package.open_run(other).evaluate([design], **options)
     (other / "designs").mkdir()
     shutil.copy(design, other / "designs")
-    at_home = package.open_run(other).evaluate(**OPTIONS)
+    at_home = package.open_run(other).evaluate(**options)
     assert without_times(there) == without_times(at_home)
-    assert len(there.rows) == 9
-    elsewhere = package.open_run(own).evaluate([design], rays=[8])
+    assert len(there.rows) == 6 + len(LAYOUTS[layout])
+    elsewhere = package.open_run(own).evaluate([design], rays=[8], baselines=["none"])
     assert there.rows[0].value != elsewhere.rows[0].value
 
 
@@ -79,7 +69,8 @@ def test_the_command_takes_the_run_that_is_named(lidardesign, runs):
     assert without_times(json.loads(found.out)) == without_times(json.loads(json.dumps(scores.as_dict())))
     # the run that judges has a design of the name, too
     package.open_run(other).fit(layout="even", sensors=1, rays=8, name="even").save()
-    both = lidardesign("evaluate", other, design, "--in", other, "--rays", 8, "--json").json
+    alone = ("--rays", 8, "--baseline", "none", "--json")
+    both = lidardesign("evaluate", other, design, "--in", other, *alone).json
     values = {row["design"]: row["value"] for row in both["rows"]}
     assert values["own/even"] == found.json["rows"][0]["value"]
     assert "other/even" in values
@@ -90,7 +81,7 @@ def test_without_baselines_designs_score_and_pair_as_beside_them(lidardesign, ru
     files = [own / "designs" / f"{layout}.yaml" for layout in LAYOUTS]
     options = (*files, "--in", other, "--rays", 8, "--baseline", "none")
     found = lidardesign("evaluate", *options, "--json").json
-    scores = package.open_run(other).evaluate(files, rays=[8])
+    scores = package.open_run(other).evaluate(files, rays=[8], baselines=["lloyd"])
     assert [(row["design"], row["value"]) for row in found["rows"]] == [
         (row.design, row.value) for row in scores.rows[:2]
     ]
@@ -109,32 +100,28 @@ def test_designs_of_two_runs_need_one_that_judges(lidardesign, runs):
         refused = lidardesign("evaluate", *named)
         assert refused.code == 2
         assert "--in RUN" in refused.err
-    assert lidardesign("evaluate", *files, "--in", own, "--rays", 8).code == 0
+    assert lidardesign("evaluate", *files, "--in", own, "--rays", 8, "--baseline", "none").code == 0
 
 
 def test_runs_that_differ_in_their_seed_alone_have_no_note(runs, tmp_path):
     notes = []
-    twin = package.open_run(make_run(tmp_path / "twin", seed=9))
-    twin.evaluate([runs[0] / "designs" / "even.yaml"], rays=[8], notes=notes.append)
+    twin = package.open_run(make_run(tmp_path / "twin", seed=9, overrides=["test=5"]))
+    twin.evaluate([runs[0] / "designs" / "even.yaml"], rays=[8], baselines=["none"], notes=notes.append)
     assert notes == []
 
 
 def test_a_design_of_another_task_is_scored_where_it_can_be(runs, tmp_path):
-    own, _ = runs
-    aisle = package.open_run(make_run(tmp_path / "aisle", task="warehouse", seed=3))
+    flat = package.open_run(runs[0])
+    aisle = package.open_run(make_run(tmp_path / "aisle", task="warehouse", overrides=["test=2", "train=4"]))
     notes = []
-    design = own / "designs" / "even.yaml"
-    scores = aisle.evaluate([design], rays=[4], settings={"test": 2, "train": 4}, notes=notes.append)
-    assert scores.rows[0].design == "even"
+    design = runs[0] / "designs" / "even.yaml"
+    (row,) = aisle.evaluate([design], rays=[4], baselines=["none"], notes=notes.append).rows
+    assert row.design == "even"
     assert notes[0].startswith("even of ")
     assert notes[0].endswith("; 2 of 2 sensors start, point or listen outside its design space")
-
-
-def test_rays_that_follow_a_condition_are_refused_where_nothing_is_followed(runs, tmp_path):
-    aisle = package.open_run(make_run(tmp_path / "aisle", task="warehouse", seed=3))
     along = aisle.fit(sensors=1, rays=4, name="along")
     with pytest.raises(ConfigError, match="its rays follow x_m, which the task flatland does not have"):
-        package.open_run(runs[0]).evaluate([along], rays=[4])
+        flat.evaluate([along], rays=[4])
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Seams between the parts: designs through their files, moving meshes and turned worlds, all the way to the rows."""
+"""Seams between the parts: moving meshes and turned worlds, all the way to the rows."""
 
 from __future__ import annotations
 
@@ -8,14 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support import references
-from support.command_line import caller
 from support.fits import design_of, fitted
 
-from lidardesign.config import resolve, save_run_config
-from lidardesign.formats.designs import load_design
-from lidardesign.registry import load_task
-from lidardesign.run.manifest import start_manifest
-from lidardesign.samples import Samples, save_samples
+from lidardesign.samples import Samples
 from lidardesign.scenes.scene import Body, Capsule, Mesh, Scene, Sphere, rigid
 from lidardesign.scoring.evaluation.request import EvaluationRequest
 from lidardesign.scoring.evaluation.score import evaluate
@@ -71,12 +66,6 @@ def request(designs, scenes, space=CEILING, rays=(40,), **changes):
     return EvaluationRequest(**{**values, "designs": designs, "space": space, "rays": rays, **changes})
 
 
-def figures(evaluation):
-    """What a row says, without how long it took."""
-    rows = [*evaluation.rows, *evaluation.equal_bandwidth]
-    return [(row.design, row.rays, row.bandwidth_mbps, row.failures, row.per_scene.tolist()) for row in rows]
-
-
 def icosphere(subdivisions=3):
     import trimesh
 
@@ -118,55 +107,3 @@ def test_rows_of_a_fitted_design_stay_when_the_world_turns_by_a_quarter():
         assert after.details == before.details
         assert after.bandwidth_mbps == pytest.approx(before.bandwidth_mbps, rel=1e-12)
         np.testing.assert_allclose(after.per_scene, before.per_scene, rtol=1e-9)
-
-
-@pytest.fixture
-def lidardesign(capsys, tmp_path, monkeypatch):
-    """Run the program in this process; the target density is the planted one."""
-    monkeypatch.setattr("lidardesign.fitting.request.RunTarget.__call__", lambda self, points: log_shelf(points))
-    return caller(capsys, tmp_path, monkeypatch)
-
-
-def log_shelf(points):
-    """A shelf's front about 1 m away, between 0.1 and 1.9 m above the sensor."""
-    front, height = points[:, 5] * np.cos(points[:, 4]), points[:, 5] * np.sin(points[:, 4])
-    return -0.5 * (np.square((front - 1.0) / 0.05) + np.square((height - 1.0) / 0.5))
-
-
-@pytest.fixture
-def aisle(tmp_path):
-    """A run of the warehouse, as `learn` leaves it."""
-    config = resolve(load_task("warehouse"), preset="draft", seed=3, overrides=["task.size=small"])
-    folder = tmp_path / "aisle"
-    points = config.space.sample(40_000, np.random.default_rng(0))
-    start_manifest(folder, command=["lidardesign", "learn"], seed=3)
-    save_run_config(config, folder)
-    log_prob = np.full(len(points), -config.space.log_volume)
-    save_samples(Samples(points, log_prob, log_shelf(points), config.space), folder)
-    return folder
-
-
-def test_rays_along_a_condition_score_the_same_where_their_run_is_gone(lidardesign, aisle, tmp_path):
-    assert lidardesign("fit", aisle, "--sensors", 2, "--rays", 6).code == 0
-    inside, away = aisle / "designs" / "fit.yaml", tmp_path / "away.yaml"
-    away.write_text(inside.read_text().replace("name: fit", "name: away"))
-    result = lidardesign("evaluate", inside, away, "--rays", 6, "--json")
-    assert result.code == 0, result.err
-    rows = {row["design"]: row for row in result.json["rows"]}
-    for key in ("value", "bandwidth_mbps", "failures"):
-        assert rows["away"][key] == rows["fit"][key]
-    assert rows["fit"]["value"] < rows["uniform"]["value"]
-
-
-@pytest.mark.parametrize("layout", ["even", "chosen"])
-def test_a_design_for_one_position_drives_along_the_aisle_as_it_is(lidardesign, aisle, layout):
-    made = ("--at", "x_m=0.37", "--layout", layout, "--rays", 6, "--sensors", 2, "--name", "here")
-    assert lidardesign("fit", aisle, *made).code == 0
-    result = lidardesign("evaluate", aisle, "--rays", 6, "--json")
-    assert result.code == 0, result.err
-    rows = {row["design"]: row for row in result.json["rows"]}
-    assert rows["here"]["bandwidth_mbps"] < rows["uniform"]["bandwidth_mbps"]
-    design = load_design(aisle / "designs" / "here.yaml")
-    here, there = (design.rays(at={"x_m": x}) for x in (0.37, 3.0))
-    np.testing.assert_array_equal(here.direction, there.direction)
-    np.testing.assert_array_equal(here.gate_m, there.gate_m)

@@ -28,34 +28,29 @@ OFFERED = [
 
 
 def asked(line):
-    """What the program answers bash at the end of a line."""
+    """The variables with which bash asks the program at the end of a line."""
     words = f"lidardesign {line}"
-    variables = {"_LIDARDESIGN_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(words.count(" "))}
-    return subprocess.run(
-        [sys.executable, "-m", "lidardesign"],
-        env={**os.environ, **variables},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    return {"_LIDARDESIGN_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(words.count(" "))}
 
 
 @pytest.mark.parametrize(("line", "candidate"), OFFERED)
-def test_a_shell_is_offered_commands_options_and_values(line, candidate):
-    assert candidate in asked(line).stdout.split()
+def test_a_shell_is_offered_commands_options_and_values(lidardesign, monkeypatch, line, candidate):
+    for name, value in asked(line).items():
+        monkeypatch.setenv(name, value)
+    assert candidate in lidardesign().out.split()
 
 
 def test_what_fails_while_a_shell_asks_says_nothing():
-    failed = asked("learn --set le")
+    command = [sys.executable, "-m", "lidardesign"]
+    environment = {**os.environ, **asked("learn --set le")}
+    failed = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert (failed.returncode, failed.stdout, failed.stderr) == (1, "", "")
 
 
-def test_the_script_of_a_shell_is_shown():
-    command = [sys.executable, "-m", "lidardesign", "--show-completion", "bash"]
+def test_the_script_of_a_shell_is_shown(lidardesign, monkeypatch):
     # a suite may be run by no shell at all
-    named = {**os.environ, "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"}
-    done = subprocess.run(command, capture_output=True, text=True, check=True, env=named)
-    assert "_LIDARDESIGN_COMPLETE" in done.stdout
+    monkeypatch.setenv("_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION", "1")
+    assert "_LIDARDESIGN_COMPLETE" in lidardesign("--show-completion", "bash").out
 
 
 @pytest.mark.parametrize("name", completion.detectors())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import re
 from types import SimpleNamespace
@@ -11,7 +10,6 @@ import jsonschema
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.command_line import make_run
 
 from lidardesign.api.config_reference import config_template, config_text, default_document, schema_of
 from lidardesign.config import PRESETS, DensitySettings, LearningSettings, resolve
@@ -213,29 +211,12 @@ def test_the_schema_of_constraints_takes_what_the_program_takes(values):
     assert accepts(schema_of("constraints"), values) == taken
 
 
-@pytest.fixture(scope="module")
-def evaluation(tmp_path_factory):
-    """What `evaluate --json` prints, with nearly all that adds to it."""
-    import contextlib
-
-    from lidardesign.cli.main import run
-
-    flat = make_run(tmp_path_factory.mktemp("runs") / "flat", count=1000)
-
-    def printed(*arguments):
-        out = io.StringIO()
-        with contextlib.redirect_stdout(out), pytest.raises(SystemExit) as ended:
-            run([str(argument) for argument in arguments])
-        assert not ended.value.code
-        return json.loads(out.getvalue())
-
-    printed("fit", flat, "--layout", "even", "--sensors", 1, "--json")
+def test_what_evaluate_prints_is_valid_and_complete(lidardesign, flat):
+    """With nearly all that adds to it."""
+    assert lidardesign("fit", flat, "--layout", "even", "--sensors", 1).code == 0
     search = ("--baseline", "cma", "--cma-seconds", 0.1, "--set", "test=2")
     audited = ("--effects", "audit", "--mount-error", "5mm")
-    return printed("evaluate", flat, "--rays", 9, *search, *audited, "--json", "--quiet")
-
-
-def test_what_evaluate_prints_is_valid_and_complete(evaluation):
+    evaluation = lidardesign("evaluate", flat, "--rays", 9, *search, *audited, "--json", "--quiet").json
     schema = schema_of("evaluate")
     jsonschema.Draft202012Validator(schema).validate(evaluation)
     for name in ("rows", "paired", "equal_bandwidth", "effects", "cma", "error_estimates", "audit", "mounting"):

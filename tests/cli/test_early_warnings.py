@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 from lidardesign_tasks.units import doubtful_meshes, doubtful_motion
-from support.command_line import caller, make_run
+from support.command_line import caller
 
 from lidardesign.config import load_run_config
 from lidardesign.density.objective.prepare import resolution_notes
@@ -67,23 +67,18 @@ def test_large_meshes_are_doubted_only_where_no_unit_was_given():
     assert doubtful_meshes({"a.stl": 300.0, "b.stl": 0.1}, 1.0)[0].startswith("1 of 2 meshes")
 
 
-@pytest.mark.parametrize("way_m", [0.6, 12.0, 600.0])
 @pytest.mark.parametrize("reach_m", [1.5, 2000.0])
-def test_a_way_is_doubted_where_it_dwarfs_what_goes_it(way_m, reach_m):
+def test_a_way_is_doubted_where_it_dwarfs_what_goes_it_or_no_sensor_reaches_it(reach_m):
     space = DesignSpace(low=SPACE.low, high=(*SPACE.high[:5], reach_m))
-    box = {"ball": np.array([[-0.1, -way_m / 2, -0.1], [0.1, way_m / 2, 0.1]])}
-    assert [line for line in doubtful_motion(box, 0.2, space) if "millimetres" in line] == doubtful_motion(
-        box, 0.2, space
-    )
-    assert bool(doubtful_motion(box, 0.2, space)) == (way_m > 100)
 
+    def notes(start_m, end_m):
+        return doubtful_motion({"ball": np.array([[-0.1, start_m, -0.1], [0.1, end_m, 0.1]])}, 0.2, space)
 
-def test_a_way_that_no_sensor_reaches_is_told_with_its_distance():
-    box = {"ball": np.array([[-0.1, 300.0, -0.1], [0.1, 303.0, 0.1]])}
-    (note,) = doubtful_motion(box, 0.2, SPACE)
-    assert "no nearer than 300 m" in note
-    assert "reach 1.5 m" in note
-    assert doubtful_motion({}, 0.2, SPACE) == []
+    assert notes(-0.3, 0.3) == notes(-6.0, 6.0) == doubtful_motion({}, 0.2, space) == []
+    (line,) = notes(-300.0, 300.0)
+    assert "millimetres" in line
+    far = notes(300.0, 303.0)
+    assert ["no nearer than 300 m" in note and "reach 1.5 m" in note for note in far] == [True] * (reach_m < 300)
 
 
 def test_a_motion_in_millimetres_is_told_before_learning(call, parts):
@@ -104,27 +99,17 @@ def test_one_mesh_is_told_to_be_both_trained_on_and_held_out(tmp_path):
         config = task.Config(folder=tmp_path)
         notes = notes_of(task, config, task.space(config))
         assert notes[0].startswith(f"{count} mesh")
-        alone = [note for note in notes if note.startswith("part1.stl is the only mesh: training and held-out scenes")]
-        assert len(alone) == 2 - count
+        assert sum(note.startswith("part1.stl is the only mesh") for note in notes) == 2 - count
 
 
-def test_a_task_without_notes_has_none_and_one_with_anything_else_is_refused():
-    assert notes_of(load_task("flatland"), None, SPACE) == []
+def test_notes_that_are_no_lines_are_the_tasks_fault():
     for found in ("one line", [3], [None]):
-        task = type("Loud", (), {"name": "loud", "notes": lambda self, config, space, found=found: found})()
+        task = SimpleNamespace(name="loud", notes=lambda config, space, found=found: found)
         with pytest.raises(PluginError, match="loud"):
             notes_of(task, None, SPACE)
 
 
-# ------------------------------------------------------------------- designs
-
-
 RAYS = "origin_x_m,origin_y_m,origin_z_m,azimuth_rad,elevation_rad,gate_start_m,gate_end_m\n"
-
-
-@pytest.fixture(scope="module")
-def flat(tmp_path_factory):
-    return make_run(tmp_path_factory.mktemp("flat") / "run", count=1000)
 
 
 def rig(run, name, factor, start=0.3):
@@ -141,15 +126,14 @@ def rig(run, name, factor, start=0.3):
 
 
 @pytest.mark.parametrize("factor", [1, 1000])
-def test_a_rig_in_millimetres_is_told_wherever_it_meets_a_run(capsys, monkeypatch, flat, factor):
-    call = caller(capsys, flat.parent, monkeypatch)
+def test_a_rig_in_millimetres_is_told_wherever_it_meets_a_run(lidardesign, flat, factor):
     name = rig(flat, f"rig{factor}.csv", factor).name
     commands = (
         ("show", name, "--in", flat),
         ("evaluate", name, "--in", flat, "--rays", 9, "--set", "test=1", "--baseline", "none"),
     )
     for arguments in commands:
-        result = call(*arguments)
+        result = lidardesign(*arguments)
         assert result.code == 0, result.err
         said = " ".join((result.out + result.err).split())
         assert ("m outside the run's design space; are its lengths in millimetres?" in said) == (factor > 1), arguments

@@ -6,7 +6,6 @@ import json
 from types import SimpleNamespace
 
 import pytest
-from support.command_line import caller
 
 from lidardesign.cli.terminal import grids as progress
 from lidardesign.cli.terminal.grids import ProgressDisplay
@@ -15,10 +14,9 @@ from lidardesign.errors import BackgroundNote
 
 
 @pytest.fixture
-def lidardesign(capsys, tmp_path, monkeypatch):
-    """Run the program in this process, in an empty folder."""
-    program = caller(capsys, tmp_path, monkeypatch)
-    return lambda line, *more: program(*line.split(), *more)
+def lidardesign(call):
+    """The program with its first words as one line."""
+    return lambda line, *more: call(*line.split(), *more)
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ LEARN_TINY = set_options(SET_TINY)
 
 @pytest.fixture
 def flat(tmp_path):
-    return make_run(tmp_path / "it's a run; of mine")
+    return make_run(tmp_path / "it's a run; of mine", count=1000, overrides=["test=4"])
 
 
 def pasted(text):
@@ -33,25 +33,12 @@ def pasted(text):
     return shlex.split(line)[1:]
 
 
-def test_a_configuration_names_its_task(lidardesign, tmp_path):
+def test_a_configuration_or_a_run_that_is_resumed_names_its_task(lidardesign, flat, tmp_path):
     (tmp_path / "flat.yaml").write_text("task_name: flatland\n")
-    plan = lidardesign("learn", "--config", "flat.yaml", "--dry-run", "--json").json
-    assert plan["settings"]["task_name"] == "flatland"
-    assert plan["writes"][0].startswith("runs/flatland/")
-
-
-def test_without_any_name_of_a_task_there_is_nothing_to_learn(lidardesign, tmp_path):
-    (tmp_path / "empty.yaml").write_text("preset: draft\n")
-    for arguments in (["learn"], ["learn", "--config", "empty.yaml"], ["learn", "--resume", "--out", "absent"]):
-        result = lidardesign(*arguments)
-        assert result.code == 2
-        assert "no task was named" in result.err
-        assert "flatland" in result.err
-
-
-def test_a_run_that_is_resumed_knows_its_task(lidardesign, flat):
-    plan = lidardesign("learn", "--resume", "--out", flat, "--dry-run", "--json")
-    assert plan.json["settings"]["task_name"] == "flatland"
+    for options in (("--config", "flat.yaml"), ("--resume", "--out", flat)):
+        plan = lidardesign("learn", *options, "--dry-run", "--json").json
+        assert plan["settings"]["task_name"] == "flatland"
+        assert plan["writes"][0].startswith("runs/flatland/" if "--config" in options else str(flat))
 
 
 def test_a_run_with_a_goal_is_resumed_with_its_own_options_and_refuses_other_values(lidardesign, tmp_path):
@@ -109,10 +96,7 @@ def test_what_would_be_replaced_is_said_before(lidardesign, old, tmp_path):
 
 
 # Where Ctrl-C comes, and whether anything of the new run is kept then.
-INTERRUPTIONS = {"train": False, "_advance": True}
-
-
-@pytest.mark.parametrize(("method", "kept"), INTERRUPTIONS.items())
+@pytest.mark.parametrize(("method", "kept"), [("train", False), ("_advance", True)])
 def test_the_old_run_stays_as_it_is_while_the_new_one_is_not_finished(
     lidardesign, old, tmp_path, monkeypatch, method, kept
 ):
@@ -134,15 +118,12 @@ def test_the_old_run_stays_as_it_is_while_the_new_one_is_not_finished(
         assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
-REFUSED = {"the old one": "run", "the new one": "run.new"}
-
-
-@pytest.mark.parametrize("which", REFUSED)
+@pytest.mark.parametrize("which", ["run", "run.new"])
 def test_both_runs_are_kept_where_a_folder_cannot_be_renamed(lidardesign, old, tmp_path, monkeypatch, which):
     rename = Path.rename
 
     def refuse(self, target):
-        if self.name == REFUSED[which]:
+        if self.name == which:
             raise OSError(errno.EACCES, "Permission denied")
         return rename(self, target)
 
@@ -154,19 +135,6 @@ def test_both_runs_are_kept_where_a_folder_cannot_be_renamed(lidardesign, old, t
     now = files_under(tmp_path)
     assert {name: now[name] for name in old} == old
     verify(tmp_path / "run.new", "samples.npz")
-
-
-def test_a_run_that_is_being_written_is_not_replaced(lidardesign, old, tmp_path):
-    with run_lock(tmp_path / "run"):
-        assert learned(lidardesign, "--seed", 1, "--overwrite").code == 2
-    assert files_under(tmp_path) == old
-
-
-def test_only_runs_are_replaced(lidardesign, tmp_path):
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "thesis.tex").write_text("years of work")
-    assert learned(lidardesign, "--overwrite").code == 2
-    assert (tmp_path / "run" / "thesis.tex").read_text() == "years of work"
 
 
 def test_a_run_whose_plugin_is_gone_names_the_package(lidardesign, tmp_path, monkeypatch):

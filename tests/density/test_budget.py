@@ -13,7 +13,6 @@ from lidardesign.api.learn import MOST_STEPS
 from lidardesign.density.training import trainer as training
 from lidardesign.density.training.checkpoint import load_arrays
 from lidardesign.density.training.learn import learn, prepare_training_data
-from lidardesign.density.training.quality import IndependentProbes
 
 STRETCH = 10
 # The flow misplaces more when balancing begins, and less after all steps.
@@ -113,7 +112,7 @@ def test_a_run_whose_time_was_over_is_the_run_of_its_steps(tmp_path):
 def test_too_few_probes_stop_nothing(tmp_path, monkeypatch):
     config = config_of(**EARLY, misplaced=1.0, steps=60)
     data = prepare_training_data(BallTask(), config)
-    few = IndependentProbes(*(values[:99] for values in vars(data.probes).values()))
+    few = data.probes.subset(slice(99))
     assert learn(BallTask(), config, tmp_path).steps == 40
     monkeypatch.setattr(
         "lidardesign.density.training.learn.prepare_training_data", lambda *_: replace(data, probes=few)

@@ -17,7 +17,6 @@ from lidardesign.density.coordinates import (
     log_target,
     log_target_values,
     on_device,
-    stays_on,
 )
 from lidardesign.density.network import DesignFlow
 from lidardesign.density.objective.target import build_target
@@ -122,8 +121,6 @@ def test_columns_that_are_drawn_stand_for_all_on_the_device_too(weighted):
 def test_what_needs_rays_cast_stays_on_the_processor():
     host, _ = targets(FIXED, "raycast")
     assert on_device(host, CPU) is host
-    assert stays_on(host, CPU)
-    assert not stays_on(host, torch.device("cuda"))
 
 
 def test_points_that_are_not_finite_are_refused_as_on_the_processor():

@@ -10,8 +10,8 @@ import trimesh
 from support import references
 
 from lidardesign.config import DensitySettings
-from lidardesign.density.fields.bodies import Pairs, collect_bodies, occluding_bodies
-from lidardesign.density.fields.distance import BodyField
+from lidardesign.density.fields.bodies import Pairs, occluding_bodies
+from lidardesign.density.fields.distance import BodyField, build_field
 from lidardesign.density.objective.proposals import independent_points
 from lidardesign.density.objective.surfaces import MovingFrames
 from lidardesign.density.objective.target import build_target
@@ -140,7 +140,7 @@ def test_parts_of_all_frames_average_to_the_whole():
 
 def test_bodies_are_found_by_their_boxes_as_by_looking_at_all():
     scenes = moving_scenes(frames=4)
-    bodies = collect_bodies(scenes, lambda body: not isinstance(body.shape, Plane), resolution=24, padding_m=0.1)
+    bodies = build_field(scenes, lambda body: not isinstance(body.shape, Plane), resolution=24, padding_m=0.1).bodies
     points = np.random.default_rng(5).uniform(-0.6, 0.8, (400, 3))
     everything = BodyField(bodies).distances(points)
     from lidardesign.density.objective.surfaces import near_pairs
@@ -232,6 +232,6 @@ def test_a_quadrature_over_thousands_of_bodies_is_refused():
 def test_a_frame_costs_a_pose_and_no_grid_even_where_scenes_have_copies_of_a_mesh():
     generator = np.random.default_rng(0)
     scenes = [Scene((Body(cube(generator), "part", "target", tracks(generator, 250)),)) for _ in range(2)]
-    bodies = collect_bodies(scenes, lambda body: True, resolution=16, padding_m=0.05)
+    bodies = build_field(scenes, lambda body: True, resolution=16, padding_m=0.05).bodies
     assert bodies.columns == 500
     assert len(bodies.grids.meshes) == 1

@@ -6,7 +6,7 @@ import pytest
 from support.command_line import set_options
 from support.learning import interrupt_after_a_checkpoint
 
-from lidardesign.density.training import quality
+from lidardesign.density.objective import proposals
 
 SETTINGS = (
     "size=small", "train=2", "test=1", "frames=6", "learning.steps=40", "learning.batch=64", "learning.samples=1000",
@@ -51,14 +51,14 @@ def test_a_space_too_narrow_for_any_ray_is_refused_before_learning(lidardesign):
 
 
 def test_coverage_that_cannot_be_measured_counts_as_none_and_is_said(lidardesign, monkeypatch):
-    draw = quality.independent_points
+    draw = proposals.independent_points
 
     def none_is_drawn_at_the_end(target, count, generator):
         points, log_density = draw(target, count, generator)
         kept = 0 if count == 1500 else len(points)
         return points[:kept], log_density[:kept]
 
-    monkeypatch.setattr(quality, "independent_points", none_is_drawn_at_the_end)
+    monkeypatch.setattr(proposals, "independent_points", none_is_drawn_at_the_end)
     done = learn(lidardesign, "run", "--set", "learning.steps=3", "--set", "learning.coverage_proposals=1500")
     assert done.code == 0
     assert done.json["coverage"] == 0

@@ -23,13 +23,12 @@ from lidardesign.density.training.checkpoint import (
     stored_snapshots,
 )
 from lidardesign.density.training.learn import learn, prepare_training_data
-from lidardesign.density.training.quality import IndependentProbes
 from lidardesign.density.training.sampling import log_density_of
 from lidardesign.density.training.trainer import AVERAGING, BETAS, Adam
 from lidardesign.errors import ConfigError, DataError, PluginError
 from lidardesign.numerics import HALF_DIGITS
 from lidardesign.run.manifest import verify
-from lidardesign.samples import load_samples
+from lidardesign.samples import Samples, load_samples
 from lidardesign.space import DesignSpace
 
 
@@ -64,8 +63,8 @@ def test_a_resumed_run_is_an_uninterrupted_run_bit_for_bit(finished, tmp_path, s
 def test_proposals_on_the_faces_of_the_space_are_inside_the_flows_box(monkeypatch):
     # the space counts what is outside by rounding as inside; the flow's density would be 0 there
     points = np.array([[0, 0, 0, 0.4 + 1e-10, 0, 1.0], [0, 0, 0, 0.1, 0, 0.2 - 1e-10]])
-    probes = IndependentProbes(points, np.zeros(2), np.zeros(2))
-    monkeypatch.setattr(learning, "draw_probes", lambda *_: probes)
+    probes = Samples(points, np.zeros(2), np.zeros(2), SPACE)
+    monkeypatch.setattr(learning, "independent_samples", lambda *_: probes)
     pool = prepare_training_data(BallTask(), config_of()).pool
     assert SPACE.contains(points).all()
     assert float(pool.unit.abs().max()) == 1.0

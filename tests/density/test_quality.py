@@ -12,7 +12,6 @@ from support import references
 from lidardesign.density.training.quality import coverage, overlap, quality, worse_of
 from lidardesign.density.training.sampling import Thinning, condition_groups
 from lidardesign.errors import NumericalError
-from lidardesign.estimates import Estimate
 from lidardesign.samples import Samples
 from lidardesign.space import DesignSpace
 
@@ -90,7 +89,6 @@ def test_coverage_takes_a_log_z_per_proposal_and_nothing_covers_nothing():
     log_target = np.array([0.0, 10.0])
     assert coverage(np.zeros(2), log_target, log_target, np.array([0.0, 10.0])).value == 1.0
     assert coverage(np.zeros(2), log_target, log_target, 0.0).value == 0.5
-    assert coverage(np.zeros(0), np.zeros(0), np.zeros(0), 0.0) == Estimate(0.0, None)
 
 
 def test_standard_errors_are_the_spread_over_other_samples():

@@ -9,7 +9,7 @@ import pytest
 from support import references
 
 from lidardesign.config import DensitySettings
-from lidardesign.density.objective.target import build_target, nearby_order
+from lidardesign.density.objective.target import build_target
 from lidardesign.scenes.scene import Body, Capsule, Plane, Scene, Sphere, rigid
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace
 
@@ -102,17 +102,3 @@ def test_a_capsule_without_length_is_a_ball_in_moving_scenes_too():
     alone = build_target([Scene((behind,))], SPACE, SETTINGS, "off")
     assert (sphere.log_density(points) < alone.log_density(points)).any()
     np.testing.assert_allclose(capsule.log_density(points), sphere.log_density(points), atol=1e-9)
-
-
-@pytest.mark.parametrize("count", [0, 1, 2, 1000])
-def test_every_point_is_visited_once(count):
-    points = np.random.default_rng(0).normal(size=(count, 3))
-    np.testing.assert_array_equal(np.sort(nearby_order(points)), np.arange(count))
-
-
-def test_points_are_visited_neighbour_after_neighbour_whatever_their_scale_and_place():
-    points = np.random.default_rng(1).uniform(size=(2000, 3)) * (1.0, 5.0, 0.1)
-    step = np.linalg.norm(np.diff(points[nearby_order(points)], axis=0), axis=1).mean()
-    assert step < 0.25 * np.linalg.norm(np.diff(points, axis=0), axis=1).mean()
-    points = np.random.default_rng(3).integers(0, 1024, size=(300, 3)).astype(float)
-    np.testing.assert_array_equal(nearby_order(points), nearby_order(8 * points + 4096))

@@ -13,7 +13,7 @@ from support.sensors import normal_sensor
 from lidardesign import open_run
 from lidardesign.formats.designs import load_design
 from lidardesign.sensors.bandwidth import Bandwidth
-from lidardesign.sensors.compare import angle_between, paired_sensors, readout_of
+from lidardesign.sensors.compare import angles_between, difference, paired_sensors, readout_of
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import save_design
 from lidardesign.sensors.pattern import Pattern
@@ -38,22 +38,22 @@ def test_a_design_does_not_differ_from_itself_however_its_sensors_are_ordered_an
         order = generator.permutation(6)
         other = tuple(replace(own[index], name=f"other{place}") for place, index in enumerate(order))
         pairs = paired_sensors(DesignSpec("a", own), DesignSpec("b", other))
-        assert [pair.first.name for pair in pairs] == [sensor.name for sensor in own]
+        assert [one.name for one, _ in pairs] == [sensor.name for sensor in own]
         for pair in pairs:
-            assert all(value in (0, None) for value in pair.as_dict()["difference"].values())
+            assert all(value in (0, None) for value in difference(*pair)["difference"].values())
 
 
 def test_sensors_of_the_same_names_are_compared_by_name():
     own = sensors(0, 3)
     swapped = tuple(replace(sensor, name=own[index].name) for index, sensor in enumerate(own[::-1]))
     pairs = paired_sensors(DesignSpec("a", own), DesignSpec("b", swapped[::-1]))
-    assert [(pair.first.name, pair.second.name) for pair in pairs] == [("s0", "s0"), ("s1", "s1"), ("s2", "s2")]
+    assert [(one.name, other.name) for one, other in pairs] == [("s0", "s0"), ("s1", "s1"), ("s2", "s2")]
 
 
 def test_differences_turn_their_sign_with_the_order_and_sensors_left_over_are_named():
     first, second = DesignSpec("a", sensors(2, 2)), DesignSpec("b", sensors(3, 4, "t"))
-    there = [pair.as_dict() for pair in paired_sensors(first, second)]
-    back = {pair.as_dict()["b"]: pair.as_dict() for pair in paired_sensors(second, first)}
+    there = [difference(*pair) for pair in paired_sensors(first, second)]
+    back = {pair["b"]: pair for pair in (difference(*both) for both in paired_sensors(second, first))}
     assert sorted(pair["b"] for pair in there) == ["t0", "t1", "t2", "t3"]
     assert [pair["a"] for pair in there[2:]] == [None, None]
     for pair in there[:2]:
@@ -66,7 +66,7 @@ def test_differences_turn_their_sign_with_the_order_and_sensors_left_over_are_na
 
 def test_an_angle_is_exact_for_the_smallest_and_the_largest():
     for angle in (0.0, 1e-9, 1e-4, 1.0, math.pi - 1e-9, math.pi):
-        found = angle_between(direction(0.0, 0.0), direction(angle, 0.0))
+        found = angles_between(direction(0.0, 0.0), direction(angle, 0.0))
         assert found == pytest.approx(angle, rel=1e-7, abs=1e-15)
 
 
@@ -117,7 +117,7 @@ def test_two_designs_differ_in_what_is_shown(call, run):
     assert [design["name"] for design in found["designs"]] == ["few", "tight"]
     assert found["constraints"] == {"budget.bandwidth_mbps": [None, 900], "gate.width_m.max": [None, 0.2]}
     pairs = paired_sensors(*(load_design(path) for path in (few, tight)))
-    assert found["sensors"] == [pair.as_dict() for pair in pairs]
+    assert found["sensors"] == [difference(*pair) for pair in pairs]
     assert "gate.width_m.max" in call("show", few, tight).out
     assert [design["bandwidth"]["rays"] for design in call("show", few, more, "--json").json["designs"]] == [8, 12]
     assert call("show", few, few, "--json").json["constraints"] == {}

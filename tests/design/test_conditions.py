@@ -141,7 +141,7 @@ def test_several_conditions_are_met_at_once_or_one_by_one():
 
 
 def test_without_a_condition_nothing_changes():
-    assert at_condition(SAMPLES, {}, None, 10, np.random.default_rng(0)) is SAMPLES
+    assert at_condition(SAMPLES, {}, log_target, 10, np.random.default_rng(0)) is SAMPLES
 
 
 FIXED = replace(SAMPLES, space=DesignSpace(AISLE.low, AISLE.high))
@@ -156,7 +156,6 @@ WORTH = r"x_m=1 the 1000 nearest samples count as only [0-3]\n(.|\n)*at least 50
         (SAMPLES, {"y_m": 0.0}, log_target, ConfigError, "x_m"),
         (SAMPLES, {"speed": 1.0}, log_target, ConfigError, "x_m"),
         (FIXED, {"x_m": 1.0}, log_target, ConfigError, "no conditions"),
-        (SAMPLES, {"x_m": 1.0}, None, ConfigError, "give the run folder"),
         (SAMPLES, {"x_m": 1.0}, lambda p: np.full(len(p), -np.inf), DataError, WORTH),
         (SAMPLES, {"x_m": 1.0}, lambda p: np.where(np.arange(len(p)) < 3, 0.0, -np.inf), DataError, WORTH),
         (SAMPLES, {"x_m": 1.0}, lambda p: np.full(len(p), np.nan), NumericalError, "x_m=1"),

@@ -13,7 +13,7 @@ from support.designs import sensor, three_sensors
 from support.strategies import patterns
 
 from lidardesign.errors import ConfigError
-from lidardesign.scenes.rays import Rays
+from lidardesign.scenes.rays import DEFAULT_RATE_HZ, Rays
 from lidardesign.sensors.bandwidth import split_budget
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.pattern import Pattern, even_rays
@@ -83,11 +83,11 @@ def test_chosen_rays_are_fired_at_the_numbers_that_they_were_chosen_for_alone():
 @pytest.mark.hard_case("35")
 @pytest.mark.parametrize("count", [0, 1, 2, 3, 50, 101])
 def test_even_rays_are_of_any_number_and_shared_out_by_weight(count):
-    rays = EVEN.rays(count, rate_hz=20)
+    rays = EVEN.rays(count)
     assert len(rays) == count
     assert (np.diff(rays.sensor) >= 0).all()
     np.testing.assert_array_equal(np.bincount(rays.sensor, minlength=3), split_budget(EVEN.weights, count, each=True))
-    np.testing.assert_allclose(rays.time_s, np.arange(count) / (max(count, 1) * 20))
+    np.testing.assert_allclose(rays.time_s, np.arange(count) / (max(count, 1) * DEFAULT_RATE_HZ))
     for index, one in enumerate(EVEN.sensors):
         own = rays.sensor == index
         assert (rays.gate_m[own] == one.gate_m).all()

@@ -203,8 +203,8 @@ BROKEN = {
     "a unit of another kind": (lambda text: text.replace("x_deg", "x_rad"), "not a ray list"),
     "a ray twice": (lambda text: text + text.splitlines()[1] + "\n", "given twice"),
     "a row cut short": (lambda text: text[:-9], ":61: "),
-    "no number": (lambda text: text.replace(",0.4,", ",wide,", 1), ":2: .*wide"),
-    "NaN": (lambda text: text.replace(",0.4,", ",nan,", 1), ":2: "),
+    "no number": (lambda text: text.replace(",0.4,", ",wide,", 1), r":2:\d+: .*wide"),
+    "NaN": (lambda text: text.replace(",0.4,", ",nan,", 1), r":2:\d+: "),
     "a negative gate": (lambda text: with_last(text, "59,0,0,0,0,0,0,0,0,-5,1,0,59"), "gate_start"),
     "mirrors beyond reach": (lambda text: with_last(text, "59,0,0,0,0,0,0,70,0,5,1,0,59"), "x_deg is 70"),
 }

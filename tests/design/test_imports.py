@@ -508,7 +508,7 @@ BAD_SDF = {
     "a model without a name": (NAMELESS, "no name"),
     "two links of one name": (posed("", f'<link name="a">{lidar()}</link>'), "a second link is called 'a'"),
     "the world inside a model": (posed(beside("world")), "'world'"),
-    "a chain of frames": (posed(beside("f0"), CHAIN), "is relative to too many others"),
+    "a chain of frames": (posed(beside("f0"), CHAIN), "too many others"),
 }
 
 

@@ -16,7 +16,6 @@ from lidardesign.mixture.components import (
     Mixture,
     angle_ratio,
     expect,
-    frames,
     label_statistics,
     linear_coefficients,
     log_density,
@@ -49,10 +48,10 @@ def test_fits_turn_with_the_world_also_across_azimuth_zero(turn):
     np.testing.assert_allclose(other.mixture.spread_rad, one.mixture.spread_rad, rtol=1e-6)
 
 
-def test_frames_equal_the_sensors_own():
+def test_frames_of_many_boresights_are_those_of_each():
     generator = np.random.default_rng(6)
     values = generator.uniform(-1.5, 1.5, (3, 7))
-    many = frames(*values)
+    many = boresight_frame(*values)
     for k in range(7):
         np.testing.assert_allclose(many[k], boresight_frame(*values[:, k]), atol=1e-15)
 

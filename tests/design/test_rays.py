@@ -123,12 +123,6 @@ def test_an_even_subset_has_its_number_of_distinct_points_in_their_order(seed, c
     assert (np.diff(kept) > 0).all()
 
 
-@pytest.mark.parametrize("count", [-1, 4])
-def test_a_subset_of_more_or_less_than_there_is_is_refused(count):
-    with pytest.raises(ConfigError, match="0 to 3"):
-        even_subset(np.zeros((3, 2)), count)
-
-
 # --- the sensor that fires a sample
 
 NO_RULES = Constraints().rules

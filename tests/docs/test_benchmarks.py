@@ -16,7 +16,6 @@ import torch
 from support.docs_session import in_process
 from support.meshes import BOX_FACES, BOX_VERTICES
 from support.small_runs import shifting_environment
-from support.tables import each_row
 
 from lidardesign.scenes.scene import Mesh
 
@@ -71,7 +70,7 @@ def run_here(monkeypatch, capsys, common):
     torch.set_rng_state(state)
 
 
-@each_row("script", SCRIPTS, ids=lambda path: path.stem)
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
 def test_a_benchmark_imports_and_explains_itself(script, run_here, capsys):
     if script.stem == "em":
         pytest.importorskip("sklearn")
@@ -206,6 +205,7 @@ ROUGH = settings("train=3", "density.sigma_m=0.04")
 # Every benchmark at its smallest that runs for a minute at most, and how many tables it prints.
 SMALLEST = [
     ("arm", ["--preset", "draft", *SMALL_ARM, "--sensors", "2", "--rays", "40"]),
+    ("commands", ROUGH),
     ("constrain", [*FACE, *ROUGH, "--only", "none"]),
     ("fields", [*FACE, "--scenes", "2", "--resolution", "24", "--trimesh-points", "50"]),
     ("flow", ["--batch", "64", "--layers", "2", "--bins", "4", "--hidden", "8"]),

@@ -8,7 +8,6 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from support.tables import each_row
 
 from lidardesign import registry
 from lidardesign.config import resolve
@@ -184,7 +183,7 @@ def test_the_drive_of_the_guide_is_scored_over_its_positions():
     assert task.score(scene, [*simulate(scene, away), *returns[1:]]).value == 25.0
 
 
-@each_row("page", [ROOT / "README.md", *sorted(DOCS.glob("*.md"))], ids=lambda p: p.name)
+@pytest.mark.parametrize("page", [ROOT / "README.md", *sorted(DOCS.glob("*.md"))], ids=lambda p: p.name)
 def test_links_lead_somewhere_and_pictures_are_small(page):
     targets = re.findall(r"\]\(([^)#:]+)\)", page.read_text(encoding="utf-8"))
     for target in targets:

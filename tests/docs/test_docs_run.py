@@ -9,7 +9,6 @@ import typer
 from support.docs_output import difference
 from support.docs_pages import PAGES, ROOT, Block, Command, blocks_of, commands_of
 from support.docs_session import COLUMNS, Library, Session, is_installed
-from support.tables import each_row
 
 from lidardesign.cli.main import app
 
@@ -41,7 +40,7 @@ def named(page) -> str:
     return str(page.relative_to(ROOT))
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("shown", "agrees"),
     [
         (TABLE, True),
@@ -107,7 +106,7 @@ def program_commands() -> list[tuple[str, Command]]:
     ]
 
 
-@each_row("page", PAGES, ids=named)
+@pytest.mark.parametrize("page", PAGES, ids=named)
 def test_the_program_understands_every_command_of_a_page(page):
     root = typer.main.get_command(app)
     for where, command in program_commands():

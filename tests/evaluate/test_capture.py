@@ -13,7 +13,6 @@ from support.sensors import normal_sensor
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.formats.galvo import degree_frame, read_galvo, scan_directions, write_galvo
 from lidardesign.scenes.rays import Rays
-from lidardesign.scoring.captures import scan as capture_ranges
 from lidardesign.scoring.captures.capture import Capture, load_capture
 from lidardesign.scoring.captures.scan import (
     Captured,
@@ -28,6 +27,7 @@ from lidardesign.scoring.captures.scan import (
 from lidardesign.scoring.captures.score import CaptureSettings, evaluate_capture
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import save_design
+from lidardesign.simulate.detector import physics
 
 BIN_M = BIN_PS * C_M_PER_PS / 2
 ESTIMATIONS = [Estimation("peak"), Estimation("matched")]
@@ -131,7 +131,7 @@ def test_clean_histograms_give_the_true_range_to_a_bin(clean, estimation):
 def test_ranges_do_not_depend_on_how_many_are_worked_on_at_once(noisy, estimation, monkeypatch):
     rays = ball_design().rays()
     found = scan(noisy, rays, 0.1, estimation)
-    monkeypatch.setattr(capture_ranges, "CHUNK_BINS", 100)
+    monkeypatch.setattr(physics, "BINS_AT_ONCE", 100)
     again = scan(noisy, rays, 0.1, estimation)
     np.testing.assert_array_equal(found.range_m, again.range_m)
     some = np.arange(0, len(rays), 7)

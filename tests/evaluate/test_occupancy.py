@@ -53,11 +53,10 @@ def test_every_ray_passes_through_an_occupied_cell_inside_the_space(case):
     space, train = CASES[case]
     layout = occupancy(space, train, seed=2)
     grid = occupancy_grid(train, space, seed=2)
-    points = layout.place(200, LayoutSite(space))
+    points, (start, end) = layout.lay_out(200, LayoutSite(space))
     assert points.shape[0] == 200
     looking = direction(points[:, 3], points[:, 4])
     assert distance_to_cells(grid, points[:, :3], looking, space.high[5]).mean() > 0.99
-    start, end = layout.gate_m
     assert space.low[5] <= start < end
     assert end <= space.high[5] + 1e-9
     filled = np.column_stack([points[:, :RAY_AXES], np.full(200, (start + end) / 2)])
@@ -69,13 +68,13 @@ def test_with_conditions_rays_start_at_the_position_and_end_in_its_cells():
     layout, grid = occupancy(AISLE, train, seed=2), occupancy_grid(train, AISLE, seed=2)
     for number, x in enumerate((0.5, 2.4)):
         space = AISLE.at({"x_m": x})
-        points = layout.place(100, LayoutSite(space, number))
+        points = layout.lay_out(100, LayoutSite(space, number))[0]
         assert (points[:, 0] == x).all()
         np.testing.assert_allclose(points[:, 3], -math.pi / 2)
         looking = direction(points[:, 3], points[:, 4])
         assert distance_to_cells(grid, points[:, :3], looking, 5.0).all()
     # beyond the last box nothing is occupied: rays are uniform there
-    nowhere = layout.place(2000, LayoutSite(AISLE.at({"x_m": 3.9}), 2))
+    nowhere = layout.lay_out(2000, LayoutSite(AISLE.at({"x_m": 3.9}), 2))[0]
     assert np.sin(nowhere[:, 4]).mean() == pytest.approx(0.5, abs=0.03)
 
 
@@ -111,11 +110,15 @@ def test_aiming_and_weighting_draw_the_same_rays():
 def test_what_was_asked_for_before_changes_no_draw():
     train = balls()
     fresh, used = (occupancy(CEILING, train, seed=5) for _ in range(2))
-    used.place(1500, LayoutSite(CEILING))
-    used.place(10, LayoutSite(CEILING, scene=4))
+    used.lay_out(1500, LayoutSite(CEILING))
+    used.lay_out(10, LayoutSite(CEILING, scene=4))
     for count in (0, 1, 30):
-        np.testing.assert_array_equal(fresh.place(count, LayoutSite(CEILING)), used.place(count, LayoutSite(CEILING)))
-    assert not np.array_equal(fresh.place(30, LayoutSite(CEILING)), fresh.place(30, LayoutSite(CEILING, scene=1)))
+        np.testing.assert_array_equal(
+            fresh.lay_out(count, LayoutSite(CEILING))[0], used.lay_out(count, LayoutSite(CEILING))[0]
+        )
+    assert not np.array_equal(
+        fresh.lay_out(30, LayoutSite(CEILING))[0], fresh.lay_out(30, LayoutSite(CEILING, scene=1))[0]
+    )
 
 
 def test_targets_out_of_reach_and_no_scenes_leave_nothing_to_aim_at():

@@ -12,10 +12,10 @@ from support.small_runs import shifted
 
 from lidardesign.api import scores as scoring
 from lidardesign.config import load_run_config, resolve, save_run_config
+from lidardesign.density.objective.proposals import independent_samples
 from lidardesign.density.training import trainer as steps
 from lidardesign.density.training.learn import learn
 from lidardesign.density.training.learned import load_flow, remeasured, seconds_at
-from lidardesign.density.training.quality import draw_probes
 from lidardesign.density.training.trainer import Trainer
 from lidardesign.errors import DataError, NumericalError
 from lidardesign.registry import load_task
@@ -87,7 +87,7 @@ def test_measurements_carry_ess_kl_and_coverage(sweeps):
 def test_errors_repeat_within_their_uncertainty_on_other_samples_and_probes(runs, sweeps):
     request = request_for(runs)
     config, target = request.config, request.target
-    probes = draw_probes(target, 8192, random_generator(99, "others"))
+    probes = independent_samples(target, 8192, random_generator(99, "others"))
     again = remeasured(runs, config, target, probes, count=8192, seed=99)
     for measurement, reached in zip(sweeps[0].measurements, again, strict=True):
         found = reached.estimates["misplaced"]

@@ -101,9 +101,17 @@ def test_the_first_scenes_error_is_raised_and_no_further_scene_is_begun(monkeypa
         return Score(1.0)
 
     monkeypatch.setattr(FlatlandTask, "score", score)
-    scenes = make_request().scene_pass(lambda number: [(random_rays(3, number),)], Planner())
+    asked = make_request()
     with pytest.raises(PluginError, match="no score of test 0"):
-        score_scenes(scenes, starmap=starmap)
+        score_scenes(
+            asked.task,
+            asked.metric,
+            asked.seed,
+            asked.test,
+            lambda number: [(random_rays(3, number),)],
+            Planner(),
+            starmap=starmap,
+        )
     assert executor.asked < 6
 
 

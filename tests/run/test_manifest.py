@@ -173,11 +173,6 @@ def test_every_damage_has_its_own_message(tmp_path, how):
         verify(run, "data.bin")
 
 
-def test_a_run_that_is_not_there_says_so(tmp_path):
-    with pytest.raises(DataError, match="no such run"):
-        verify(tmp_path / "nowhere", "data.bin")
-
-
 HOLDER = """
 import sys, time
 from lidardesign.run.files import run_lock
@@ -231,6 +226,9 @@ def test_a_writer_waits_for_one_that_holds_the_run_for_an_instant(tmp_path):
 
 
 def test_a_file_verifies_before_and_after_the_write_that_was_announced(run):
+    announce(run, "first.bin", b"content")
+    with pytest.raises(DataError, match="missing"):
+        verify(run, "first.bin")
     announce(run, "data.bin", b"new content")
     verify(run, "data.bin")
     announce(run, "data.bin", b"newer content")
@@ -242,12 +240,6 @@ def test_a_file_verifies_before_and_after_the_write_that_was_announced(run):
     write_atomic(run / "data.bin", b"0123456789")
     with pytest.raises(DataError, match="truncated"):
         verify(run, "data.bin")
-
-
-def test_a_file_that_was_announced_but_never_written_is_missing(run):
-    announce(run, "first.bin", b"content")
-    with pytest.raises(DataError, match="missing"):
-        verify(run, "first.bin")
 
 
 def test_a_file_that_somebody_is_still_making_says_to_wait(run):
@@ -279,3 +271,5 @@ def test_a_file_that_nobody_recorded_is_told_from_one_that_is_not_there_yet(run)
         verify(run, "foreign.bin")
     with pytest.raises(DataError, match=r"has no absent\.bin yet"):
         verify(run, "absent.bin")
+    with pytest.raises(DataError, match="no such run"):
+        verify(run / "nowhere", "data.bin")

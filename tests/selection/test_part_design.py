@@ -25,7 +25,7 @@ from lidardesign.rays import information
 from lidardesign.samples import load_samples
 from lidardesign.sensors.design_file import design_document, save_design
 from lidardesign.simulate.detector.files import load_detector
-from lidardesign.simulate.detector.physics import Physics
+from lidardesign.simulate.detector.physics import IDEAL, Physics
 from lidardesign.simulate.returns import simulate_many
 from lidardesign.task import Information
 
@@ -315,7 +315,7 @@ def test_cells_hold_directions_that_are_near():
 ZONES = replace(load_detector("consumer-8x8"), bins=None)
 
 
-@pytest.mark.parametrize("detector", [None, ZONES], ids=["lines", "zones"])
+@pytest.mark.parametrize("detector", [IDEAL, ZONES], ids=["lines", "zones"])
 def test_a_part_tells_what_its_own_rays_would(run, detector):
     opened = open_run(run)
     parts = [find_part(name) for name in THREE]

@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import norm
-from soak.promise import kept_promise, random_case
 from support.planning import CONSUMER, SINGLE, TIMED, decisions, facing_wall, grid, sight
 
+from benchmarks.soak.promise import kept_promise, random_case
 from lidardesign.scenes.scene import Ambient, Body, Box, Medium, Receiver, Scene, Sphere, rigid
 from lidardesign.simulate.detector.kernels import find_returns
 from lidardesign.simulate.detector.physics import FWHM_PER_SIGMA, Physics

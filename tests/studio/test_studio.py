@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.command_line import files_under
 from support.studios import make_robot_run, wait_for
 
 pytest.importorskip("viser", reason="viser is not installed (extra: studio)")
@@ -156,7 +157,7 @@ HOSTILE = {
 
 @pytest.mark.parametrize("case", HOSTILE)
 def test_what_cannot_be_done_is_a_message_and_the_page_lives_on(studio, robot, case):
-    before = {path: path.read_bytes() for path in robot.folder.parent.rglob("*") if path.is_file()}
+    before = files_under(robot.folder.parent)
     for wish, value in HOSTILE[case]:
         if wish == "saved name":
             studio._panel.name.value = value
@@ -167,10 +168,25 @@ def test_what_cannot_be_done_is_a_message_and_the_page_lives_on(studio, robot, c
             studio.wish(wish, value)
     wait_for(lambda: "This " in studio._panel._working.content)
     # the cache of training information may have grown
-    after = {path: path.read_bytes() for path in robot.folder.parent.rglob("*") if path.is_file()}
-    assert {path.name for path in after if after[path] != before.get(path)} <= {"informed.npz"}
+    after = files_under(robot.folder.parent)
+    assert {name for name in after if after[name] != before.get(name)} <= {"robot/informed.npz"}
     studio.wish("limit", ("budget.rays", "11"))
     wait_for(lambda: studio.choices.value("budget.rays") == "11")
+
+
+def test_a_field_is_narrowed_fitted_saved_shown_to_mounters_and_scored(studio, robot):
+    studio.wish("limit", ("field_of_view.horizontal_deg.max", "2"))
+    studio.wish("step", "Fit")
+    wait_for(lambda: studio.choices.state == "fitted")
+    assert all(math.degrees(sensor.field_of_view_rad[0]) <= 2 for sensor in studio.choices.sensors)
+    studio._panel.name.value = "narrow"
+    studio.wish("save")
+    wait_for(robot.design_path("narrow").exists)
+    studio.wish("mounts")
+    wait_for(lambda: [*robot.folder.rglob("mounts.html")])
+    studio.wish("step", "Score")
+    wait_for(lambda: "held-out scenes, which" in studio._panel.scores.content.replace("*", ""))
+    robot.design_path("narrow").unlink()
 
 
 def test_values_that_no_control_offers_change_nothing(studio):

@@ -47,10 +47,10 @@ def set_options(settings, further=()):
     return [word for setting in settings if setting.partition("=")[0] not in keys for word in ("--set", setting)]
 
 
-def make_run(folder: Path, count: int = 4000, task: str = "flatland", seed: int = 3) -> Path:
+def make_run(folder: Path, count: int = 4000, task: str = "flatland", seed: int = 3, overrides=()) -> Path:
     """A run as `learn` leaves it, with samples around two spots of its space instead of a learned density."""
     task = load_task(task)
-    config = resolve(task, preset="draft", seed=seed)
+    config = resolve(task, preset="draft", seed=seed, overrides=overrides)
     generator = np.random.default_rng(0)
     points = config.space.sample(count, generator)
     low, high = np.array(config.space.low), np.array(config.space.high)

@@ -1,10 +1,13 @@
-"""The register of hard cases: one class each, from which `tools/stability_table.py` writes docs/stability.md."""
+"""The register of hard cases, read from the source of tests; `tools/stability_table.py` writes its page from it.
+
+`@pytest.mark.hard_case("29", "What comes in", done="What the program does then")` stands once for each case, at the
+class of its tests. `@pytest.mark.hard_case("29")` marks further tests of it.
+"""
 
 from __future__ import annotations
 
 import ast
-from collections import Counter
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -17,62 +20,45 @@ KEYS = (
 )
 
 
-@dataclass(frozen=True)
+@dataclass
 class HardCase:
-    """One case and the class of its tests.
+    """One case.
 
     Arguments:
-        key: "1" to "40", "M1" to "M4" or "P1" to "P7".
         title: What comes in.
         done: What the program does then.
-        tests: The class.
+        tests: How many tests it has.
     """
 
-    key: str
-    title: str
-    done: str
-    tests: type
-
-    @property
-    def names(self) -> list[str]:
-        """The names of its tests, in the order in which they stand."""
-        return [name for name, value in vars(self.tests).items() if name.startswith("test_") and callable(value)]
-
-    @property
-    def elsewhere(self) -> dict[str, int]:
-        """How many tests stand with what they test, under the mark `hard_case`, by their file in tests/."""
-        return marked()[self.key]
+    title: str = ""
+    done: str = ""
+    tests: int = 0
 
 
 @lru_cache
-def marked() -> dict[str, Counter[str]]:
-    """Files of tests that bear the mark `hard_case(key)`, and how many of them, by key; read from their source."""
-    tests, found = Path(__file__).parents[1], {key: Counter() for key in KEYS}
-    for path in sorted(tests.rglob("test_*.py")):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            for mark in node.decorator_list if isinstance(node, ast.FunctionDef) else ():
-                if isinstance(mark, ast.Call) and ast.unparse(mark.func) == "pytest.mark.hard_case":
-                    found[ast.literal_eval(mark.args[0])][path.relative_to(tests).as_posix()] += 1
+def hard_cases() -> dict[str, HardCase]:
+    """All cases by key.
+
+    Raises:
+        ValueError: A mark has a key that no case has, or a case is described twice.
+    """
+    found = {key: HardCase() for key in KEYS}
+    for path in sorted(Path(__file__).parents[1].rglob("test_*.py")):
+        for node, mark in _marks(ast.parse(path.read_text(encoding="utf-8"))):
+            key, *title = map(ast.literal_eval, mark.args)
+            if key not in found:
+                raise ValueError(f"{path.name}: {node.name}: there is no hard case {key!r}")
+            case, inside = found[key], node.body if isinstance(node, ast.ClassDef) else [node]
+            case.tests += sum(isinstance(one, ast.FunctionDef) and one.name.startswith("test_") for one in inside)
+            if title and case.title:
+                raise ValueError(f"{path.name}: {node.name}: hard case {key} is described elsewhere: {case.title}")
+            if title:
+                case.title, case.done = title[0], ast.literal_eval(mark.keywords[0].value)
     return found
 
 
-CASES: dict[str, HardCase] = {}
-
-
-def hard_case(key: str, title: str, *, done: str) -> Callable[[type], type]:
-    """Register a class of tests as the one of a case.
-
-    Raises:
-        ValueError: There is no such case, or another class has it.
-    """
-
-    def register(tests: type) -> type:
-        if key not in KEYS:
-            raise ValueError(f"{tests.__name__}: there is no hard case {key!r}")
-        other = CASES.get(key)
-        if other is not None and other.tests.__qualname__ != tests.__qualname__:
-            raise ValueError(f"{tests.__name__}: hard case {key} is that of {other.tests.__name__}")
-        CASES[key] = HardCase(key, title, done, tests)
-        return tests
-
-    return register
+def _marks(tree: ast.Module) -> Iterator[tuple[ast.ClassDef | ast.FunctionDef, ast.Call]]:
+    for node in ast.walk(tree):
+        for mark in node.decorator_list if isinstance(node, ast.ClassDef | ast.FunctionDef) else ():
+            if isinstance(mark, ast.Call) and ast.unparse(mark.func) == "pytest.mark.hard_case":
+                yield node, mark

@@ -17,13 +17,16 @@ sensors:
 """
 
 
-def check_one_clear_message(result, code, words):
-    """The message is short, says what it must, is the same in JSON, and the exit code is right."""
+def check_one_clear_message(result, code, place, *words):
+    """The message is short, says where and what, is the same in JSON, and the exit code is right."""
     assert result.code == code, result.err
     document = result.json
-    assert document["schema_version"] == 1
-    assert document["exit_code"] == code
+    assert (document["schema_version"], document["exit_code"]) == (1, code)
     assert document["error"]["message"]
-    assert words in result.err
+    assert code != 4 or "conflicts" in document["error"]
+    assert place in document["error"].get("where", ""), document["error"]
+    for word in words:
+        assert word in result.err, result.err
     assert "Traceback" not in result.err
     assert len(result.err.strip().splitlines()) <= 4, result.err
+    assert len(result.err) < 5000

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from lidardesign.scenes.scene import Body, Scene, Sphere
@@ -14,6 +16,11 @@ WAVELENGTH_M = 905e-9
 PULSES = 1000
 SCENE = Scene((Body(Sphere(1.0)),), name="synthetic light")
 PHOTON_EFFECTS = frozenset({"photon_noise", "jitter", "ambient", "pile_up", "quantisation"})
+
+
+class Detected(NamedTuple):
+    path_m: np.ndarray
+    body: np.ndarray
 
 
 def counting_detector(rays: int, *, pulses: int = PULSES, dead_s: float = 0.0, repetition_hz: float = 1e6, **timing):
@@ -69,6 +76,5 @@ def counted(windows_m, echoes, light, detector, effects, seed: int = 0):
 
 
 def detected(windows_m, echoes, light, detector, effects, seed: int = 0):
-    return detect(
-        SCENE, 0, one_sensor(windows_m), windows_m, echoes, light, Physics(detector, frozenset(effects), seed)
-    )
+    physics = Physics(detector, frozenset(effects), seed)
+    return Detected(*detect(SCENE, 0, one_sensor(windows_m), windows_m, echoes, light, physics))

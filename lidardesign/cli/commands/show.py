@@ -189,7 +189,7 @@ def _show_readout(readout: BandwidthUse, rich: RichConsole) -> None:
 def _show_differences(files: Sequence[Path], designs: Sequence[DesignSpec], output: Output) -> None:
     """The sensors of two designs in pairs, what both cost, and the constraints that only one has or that differ."""
     from lidardesign.run.yaml import leaves
-    from lidardesign.sensors.compare import paired_sensors, readout_of
+    from lidardesign.sensors.compare import difference, paired_sensors, readout_of
 
     ours, theirs = (dict(leaves(design.constraints)) for design in designs)
     keys = [key for key in {**ours, **theirs} if key and ours.get(key) != theirs.get(key)]
@@ -204,7 +204,7 @@ def _show_differences(files: Sequence[Path], designs: Sequence[DesignSpec], outp
             }
             for path, design in zip(files, designs, strict=True)
         ],
-        "sensors": [pair.as_dict() for pair in paired_sensors(*designs)],
+        "sensors": [difference(*pair) for pair in paired_sensors(*designs)],
         "constraints": {".".join(map(str, key)): [ours.get(key), theirs.get(key)] for key in keys},
     }
     output.result(document, lambda rich: _show_pair(document, rich), show_costs=False)

@@ -24,14 +24,7 @@ import typer
 
 from lidardesign.cli.terminal.grids import ProgressDisplay, duration
 from lidardesign.cli.terminal.score_tables import show_times
-from lidardesign.errors import (
-    BackgroundNote,
-    ConfigError,
-    DataError,
-    LidardesignError,
-    NumericalError,
-    is_out_of_memory,
-)
+from lidardesign.errors import BackgroundNote, ConfigError, DataError, LidardesignError, NumericalError, lacks_memory
 from lidardesign.run.clock import Clock, keep_timings, peak_memory_bytes, running
 from lidardesign.run.files import write_atomic
 from lidardesign.run.outputs import check_outputs
@@ -305,7 +298,7 @@ def describe_error(error: BaseException, output: Output) -> tuple[dict[str, Any]
         cause = cause.__cause__
     if isinstance(error, LidardesignError):
         return error.as_dict(), error.exit_code, f"{error.kind} error: {error}"
-    if is_out_of_memory(error):
+    if lacks_memory(error):
         text = "the computer ran out of memory; a smaller batch, field_resolution or preset needs less"
         return {"kind": "memory", "message": text}, NumericalError.exit_code, f"memory error: {text}"
     if isinstance(error, OSError):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -182,28 +182,17 @@ class Bodies:
         fields = {name: getattr(self, name)[rows] for name in names}
         return replace(self, **fields, column=np.repeat(np.arange(len(columns)), counts), starts=starts)
 
-    def apart(self) -> Bodies:
-        """The same bodies, each in its own column."""
-        return replace(self, column=np.arange(len(self)), starts=np.arange(len(self) + 1))
-
-
-def collect_bodies(
-    scenes: Sequence[Scene], chosen: Callable[[Body], bool], *, resolution: int, padding_m: float
-) -> Bodies:
-    """The chosen bodies of all scenes and frames.
-
-    Arguments:
-        scenes: One column per scene and frame, scene by scene.
-        chosen: Which bodies count, as `lambda body: body.is_target`.
-        resolution: Grid points along the longest side of a mesh field.
-        padding_m: How far grids reach beyond their meshes [m].
-    """
-    return place_bodies(*_entries(scenes, chosen), partial(own_grid, resolution=resolution, padding_m=padding_m))
-
 
 def occluding_bodies(scenes: Sequence[Scene]) -> Bodies:
     """The occluders of all scenes and frames; their meshes are only cast at, so they have no distance grids."""
-    return place_bodies(*_entries(scenes, lambda body: body.is_occluder), _no_distances)
+    columns = [(scene, frame) for scene in scenes for frame in range(scene.frames)]
+    entries = [
+        (column, body, frame)
+        for column, (scene, frame) in enumerate(columns)
+        for body in scene.bodies
+        if body.is_occluder
+    ]
+    return place_bodies(entries, len(columns), _no_distances)
 
 
 def own_grid(mesh: Mesh, resolution: int, padding_m: float) -> tuple[Grid, np.ndarray]:
@@ -214,13 +203,6 @@ def own_grid(mesh: Mesh, resolution: int, padding_m: float) -> tuple[Grid, np.nd
 
 def _no_distances(mesh: Mesh) -> tuple[Grid, np.ndarray]:
     return grid_around(mesh.bounds_m, 2, 0.0), np.zeros(0, dtype=np.float32)
-
-
-def _entries(scenes: Sequence[Scene], chosen: Callable[[Body], bool]) -> tuple[list[Entry], int]:
-    """The chosen bodies of every scene and frame, and the number of columns."""
-    columns = [(scene, frame) for scene in scenes for frame in range(scene.frames)]
-    entries = [(c, body, frame) for c, (scene, frame) in enumerate(columns) for body in scene.bodies if chosen(body)]
-    return entries, len(columns)
 
 
 def place_bodies(entries: Sequence[Entry], columns: int, build_grid: BuildGrid) -> Bodies:

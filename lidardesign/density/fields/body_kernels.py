@@ -259,7 +259,7 @@ def all_distances(bodies, points, out, nearest):  # noqa: ANN001, ANN201
 
 @njit(cache=True, nogil=True)
 def pair_log_weights(bodies, constants, values, points, row_starts, nearest, out):  # noqa: ANN001, ANN201
-    """log weights of pairs of a point and a body, listed as `near_columns` does: out (P,).
+    """log weights of pairs of a point and a body, listed as `near_columns` does.
 
     Arguments:
         bodies: The arrays of all bodies.
@@ -267,6 +267,7 @@ def pair_log_weights(bodies, constants, values, points, row_starts, nearest, out
         values: log weights of all grids of meshes, end to end; bodies of grid 0 have none.
         points, row_starts: As in `near_columns`.
         nearest: The body of each pair, -1 for none.
+        out: Out: the log weights, shape (P,).
     """
     grid, to_body, grids = bodies.grid, bodies.to_body, bodies.grids
     for n in range(points.shape[0]):

@@ -7,9 +7,8 @@ their own frame by transforming the query. Distances are positive outside and ex
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import Protocol
 
 import numpy as np
 
@@ -23,74 +22,74 @@ MAXIMUM_TABLE_BYTES = 6 * 2**30
 FAR_M = np.float32(1e9)  # the distance of a column without a mesh in the table
 
 
-class Field(Protocol):
-    """Signed distances of all columns, with contracted gradients.
-
-    `shell_m` is half the thickness given to surfaces without an inside where they occlude, shape (columns,), and
-    `grid_steps_m` are the grid steps of all meshes [m]: none where every distance is exact.
-    """
-
-    columns: int
-    shell_m: np.ndarray
-    grid_steps_m: np.ndarray
-
-    def distances(self, points: np.ndarray) -> np.ndarray:
-        """Distances at points: (N, 3) to (N, columns) [m]."""
-
-    def gradient(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """Gradients of sum_c weights_nc * d_c(points_n): (N, 3), (N, columns) to (N, 3)."""
-
-
 @dataclass(frozen=True, eq=False)
-class TableField:
-    """Meshes at rest: one row of distances per grid point.
+class GridColumns:
+    """Values of all columns at the points of one grid: a row per grid point.
 
     Arguments:
-        table: Shape (grid points, columns) float32 [m].
+        table: Shape (grid points, columns) float32.
         grid: Where the rows are.
-        shell_m: See `Field`.
-        compiled: Whether distances come from the compiled kernels, which take 0.8 s to load.
+        compiled: Whether values come from the compiled kernels, which take 0.8 s to load.
     """
 
     table: np.ndarray
     grid: Grid
-    shell_m: np.ndarray
-    compiled: bool = True
+    compiled: bool = field(default=True, kw_only=True)
 
     @property
     def columns(self) -> int:
         """The number of columns."""
         return self.table.shape[1]
 
-    @property
-    def grid_steps_m(self) -> np.ndarray:
-        """See `Field`."""
-        return np.array([self.grid.step])
-
     @cached_property
     def arrays(self) -> GridTable:
         """As the compiled loops take it."""
-        return GridTable.on(self.grid, self.table)
+        return GridTable(self.table, self.grid.counts, self.grid.low, 1.0 / self.grid.step)
 
-    def distances(self, points: np.ndarray) -> np.ndarray:
-        """See `Field`."""
+    def _read(self, points: np.ndarray, *, grows: bool) -> np.ndarray:
+        """Values at points, (N, 3) to (N, columns): beyond the grid those at its faces, or distances that grow."""
         points = np.ascontiguousarray(points, dtype=np.float64)
         if not self.compiled:
-            return grids.table_distances(self.arrays, points)
+            return grids.table_values(self.arrays, points, grows=grows)
         from lidardesign.density.fields import table_kernels
 
         out = np.empty((len(points), self.columns), dtype=np.float32)
-        table_kernels.table_distances(self.arrays, points, out)
+        (table_kernels.table_distances if grows else table_kernels.table_values)(self.arrays, points, out)
         return out
 
-    def gradient(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """See `Field`."""
+    def _contract(self, points: np.ndarray, weights: np.ndarray, *, grows: bool) -> np.ndarray:
+        """Gradients of sum_c weights_nc * value_c(points_n): (N, 3), (N, columns) to (N, 3)."""
         from lidardesign.density.fields import table_kernels
 
-        points = np.ascontiguousarray(points, dtype=np.float64)
+        points, weights = (np.ascontiguousarray(values, dtype=np.float64) for values in (points, weights))
         out = np.empty_like(points)
-        table_kernels.table_gradient(self.arrays, points, np.ascontiguousarray(weights, np.float64), out)
+        kernel = table_kernels.table_gradient if grows else table_kernels.table_value_gradient
+        kernel(self.arrays, points, weights, out)
         return out
+
+
+@dataclass(frozen=True, eq=False)
+class TableField(GridColumns):
+    """Distances of meshes at rest [m].
+
+    Arguments:
+        shell_m: Half the thickness given to surfaces without an inside where they occlude, shape (columns,).
+    """
+
+    shell_m: np.ndarray
+
+    @property
+    def grid_steps_m(self) -> np.ndarray:
+        """The grid steps of all meshes [m]: none where every distance is exact."""
+        return np.array([self.grid.step])
+
+    def distances(self, points: np.ndarray) -> np.ndarray:
+        """Distances at points: (N, 3) to (N, columns) [m]."""
+        return self._read(points, grows=True)
+
+    def gradient(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Gradients of sum_c weights_nc * d_c(points_n): (N, 3), (N, columns) to (N, 3)."""
+        return self._contract(points, weights, grows=True)
 
 
 def all_pairs(bodies: Bodies, points: np.ndarray) -> Pairs:
@@ -120,11 +119,11 @@ class BodyField:
         np.maximum.at(self.shell_m, bodies.column, np.where(unsigned, steps, 0.0)[bodies.grid])
 
     def distances(self, points: np.ndarray) -> np.ndarray:
-        """See `Field`."""
+        """See `TableField`."""
         return all_pairs(self.bodies, points).distances.reshape(len(points), self.columns)
 
     def gradient(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """See `Field`."""
+        """See `TableField`."""
         from lidardesign.density.fields import body_kernels
 
         points = np.ascontiguousarray(points, dtype=np.float64)
@@ -149,23 +148,26 @@ class UnionField:
 
     @property
     def shell_m(self) -> np.ndarray:
-        """See `Field`."""
+        """See `TableField`."""
         return np.maximum(self.first.shell_m, self.second.shell_m)
 
     @property
     def grid_steps_m(self) -> np.ndarray:
-        """See `Field`."""
+        """See `TableField`."""
         return np.concatenate([self.first.grid_steps_m, self.second.grid_steps_m])
 
     def distances(self, points: np.ndarray) -> np.ndarray:
-        """See `Field`."""
+        """See `TableField`."""
         return np.minimum(self.first.distances(points), self.second.distances(points))
 
     def gradient(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """See `Field`."""
+        """See `TableField`."""
         nearer = self.first.distances(points) <= self.second.distances(points)
         own, other = np.where(nearer, weights, 0.0), np.where(nearer, 0.0, weights)
         return self.first.gradient(points, own) + self.second.gradient(points, other)
+
+
+Field = TableField | BodyField | UnionField
 
 
 def scene_columns(scenes: Sequence[Scene]) -> list[tuple[int, int]]:

@@ -72,11 +72,6 @@ class GridTable(NamedTuple):
     low: np.ndarray
     inverse_step: float
 
-    @classmethod
-    def on(cls, grid: Grid, table: np.ndarray) -> GridTable:
-        """A table on a grid."""
-        return cls(table, grid.counts, grid.low, 1.0 / grid.step)
-
 
 def grid_around(bounds_m: np.ndarray, resolution: int, padding_m: float) -> Grid:
     """A grid over an axis-aligned box, shape (2, 3), with `resolution` points along its longest padded side."""
@@ -235,36 +230,25 @@ def _store(path: Path, values: np.ndarray) -> None:
 CHUNK = 2048
 
 
-def table_distances(field: GridTable, points: np.ndarray) -> np.ndarray:
-    """Distances of all columns at points, a lower bound outside the grid: (N, 3) to (N, C) float32."""
+def table_values(field: GridTable, points: np.ndarray, *, grows: bool) -> np.ndarray:
+    """Values of all columns at points, (N, 3) to (N, C) float32.
+
+    Outside the grid they are those at its faces or, of distances, which grow there, a lower bound.
+    """
     out = np.empty((len(points), field.table.shape[1]), dtype=np.float32)
     for start in range(0, len(points), CHUNK):
         rows = slice(start, start + CHUNK)
         place = (points[rows] - field.low) * field.inverse_step
         clamped = np.clip(place, 0.0, field.counts - 1.0)
-        squared = np.square((place - clamped) / field.inverse_step).sum(axis=1)
-        inner = _blended(field, clamped)
-        outside = squared > 0
-        inner[outside] = np.sqrt(squared[outside, None] + np.square(np.maximum(inner[outside], 0.0)))
+        # trilinear, at places in steps from the first point of the grid
+        cell = np.minimum(clamped.astype(np.int64), field.counts - 2)
+        fraction, inner = clamped - cell, np.zeros((len(clamped), field.table.shape[1]))
+        for corner in np.ndindex(2, 2, 2):
+            weight = np.where(corner, fraction, 1.0 - fraction).prod(axis=1)
+            inner += weight[:, None] * field.table[np.ravel_multi_index(tuple((cell + corner).T), tuple(field.counts))]
+        if grows:
+            squared = np.square((place - clamped) / field.inverse_step).sum(axis=1)
+            outside = squared > 0
+            inner[outside] = np.sqrt(squared[outside, None] + np.square(np.maximum(inner[outside], 0.0)))
         out[rows] = inner
     return out
-
-
-def table_values(field: GridTable, points: np.ndarray) -> np.ndarray:
-    """Values of all columns at points, outside the grid those at its faces: (N, 3) to (N, C) float32."""
-    out = np.empty((len(points), field.table.shape[1]), dtype=np.float32)
-    for start in range(0, len(points), CHUNK):
-        rows = slice(start, start + CHUNK)
-        out[rows] = _blended(field, np.clip((points[rows] - field.low) * field.inverse_step, 0.0, field.counts - 1.0))
-    return out
-
-
-def _blended(field: GridTable, clamped: np.ndarray) -> np.ndarray:
-    """Trilinear values at places inside the grid, in steps from its first point: (N, 3) to (N, C)."""
-    cell = np.minimum(clamped.astype(np.int64), field.counts - 2)
-    fraction = clamped - cell
-    inner = np.zeros((len(clamped), field.table.shape[1]))
-    for corner in np.ndindex(2, 2, 2):
-        weight = np.where(corner, fraction, 1.0 - fraction).prod(axis=1)
-        inner += weight[:, None] * field.table[np.ravel_multi_index(tuple((cell + corner).T), tuple(field.counts))]
-    return inner

@@ -11,15 +11,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 
-from lidardesign.density.fields import grids
 from lidardesign.density.fields.bodies import Bodies, Pairs
 from lidardesign.density.fields.distance import (
     BodyField,
     Field,
+    GridColumns,
     TableField,
     UnionField,
     all_pairs,
@@ -28,7 +27,6 @@ from lidardesign.density.fields.distance import (
 )
 from lidardesign.density.fields.grids import (
     Grid,
-    GridTable,
     cached_distance_grids,
     cached_grids,
     narrow_band,
@@ -76,63 +74,22 @@ def barycentric(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     return safe_divide(areas, total, otherwise=1 / 3)
 
 
-class LogWeights(Protocol):
-    """log importance of all columns, with contracted gradients."""
+@dataclass(frozen=True, eq=False)
+class TableWeights(GridColumns):
+    """log importance of meshes at rest."""
 
-    @property
+    @cached_property
     def peak(self) -> float:
         """An upper bound of all values."""
+        return float(self.table.max())
 
     def values(self, points: np.ndarray) -> np.ndarray:
         """log w at points: (N, 3) to (N, columns)."""
+        return self._read(points, grows=False)
 
     def gradient(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Gradients of sum_c weights_nc log w_c(points_n): (N, 3), (N, columns) to (N, 3)."""
-
-
-@dataclass(frozen=True, eq=False)
-class TableWeights:
-    """Meshes at rest: one row of log weights per grid point.
-
-    Arguments:
-        table: Shape (grid points, columns) float32.
-        grid: Where the rows are.
-        compiled: See `fields.TableField`.
-    """
-
-    table: np.ndarray
-    grid: Grid
-    compiled: bool = True
-
-    @cached_property
-    def peak(self) -> float:
-        """See `LogWeights`."""
-        return float(self.table.max())
-
-    @cached_property
-    def arrays(self) -> GridTable:
-        """As the compiled loops take it."""
-        return GridTable.on(self.grid, self.table)
-
-    def values(self, points: np.ndarray) -> np.ndarray:
-        """See `LogWeights`."""
-        points = np.ascontiguousarray(points, dtype=np.float64)
-        if not self.compiled:
-            return grids.table_values(self.arrays, points)
-        from lidardesign.density.fields import table_kernels
-
-        out = np.empty((len(points), self.table.shape[1]), dtype=np.float32)
-        table_kernels.table_values(self.arrays, points, out)
-        return out
-
-    def gradient(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """See `LogWeights`."""
-        from lidardesign.density.fields import table_kernels
-
-        points, weights = (np.ascontiguousarray(values, dtype=np.float64) for values in (points, weights))
-        out = np.empty_like(points)
-        table_kernels.table_value_gradient(self.arrays, points, weights, out)
-        return out
+        return self._contract(points, weights, grows=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +111,7 @@ class BodyWeights:
 
     @property
     def peak(self) -> float:
-        """See `LogWeights`."""
+        """See `TableWeights`."""
         return float(self.column_peaks.max())
 
     @cached_property
@@ -163,11 +120,11 @@ class BodyWeights:
         return float((self.column_peaks[self.bodies.column] - self.bodies.log_weight[:, 1]).max(initial=0.0))
 
     def values(self, points: np.ndarray) -> np.ndarray:
-        """See `LogWeights`."""
+        """See `TableWeights`."""
         return self.of_pairs(points, all_pairs(self.bodies, points)).reshape(len(points), -1)
 
     def gradient(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """See `LogWeights`."""
+        """See `TableWeights`."""
         out = np.zeros(points.shape)
         pulls = np.ascontiguousarray(weights, dtype=np.float64).ravel()
         self.add_pair_gradients(points, all_pairs(self.bodies, points), pulls, out)
@@ -209,21 +166,24 @@ class UnionWeights:
 
     @property
     def peak(self) -> float:
-        """See `LogWeights`."""
+        """See `TableWeights`."""
         return max(self.first.peak, self.second.peak)
 
     def _nearer(self, points: np.ndarray) -> np.ndarray:
         return self.fields.first.distances(points) <= self.fields.second.distances(points)
 
     def values(self, points: np.ndarray) -> np.ndarray:
-        """See `LogWeights`."""
+        """See `TableWeights`."""
         return np.where(self._nearer(points), self.first.values(points), self.second.values(points))
 
     def gradient(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """See `LogWeights`."""
+        """See `TableWeights`."""
         nearer = self._nearer(points)
         own, other = np.where(nearer, weights, 0.0), np.where(nearer, 0.0, weights)
         return self.first.gradient(points, own) + self.second.gradient(points, other)
+
+
+LogWeights = TableWeights | BodyWeights | UnionWeights
 
 
 def is_weighted(scenes: Sequence[Scene]) -> bool:
@@ -296,4 +256,4 @@ def _table_weights(field: TableField, bodies: list[tuple[int, Body]]) -> TableWe
         nearer = distances < nearest[:, column]
         nearest[nearer, column] = distances[nearer]
         table[nearer, column] = values[nearer] + np.float32(np.log(body.importance))
-    return TableWeights(table, field.grid, field.compiled)
+    return TableWeights(table, field.grid, compiled=field.compiled)

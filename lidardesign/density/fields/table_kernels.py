@@ -201,6 +201,7 @@ def table_quadrature(field, clear, shell, rays, points_per_ray, attenuation, sha
         rays: Origins (N, 3), directions (N, 3) and lengths (N,) that are integrated from 0 [m].
         points_per_ray: The number of midpoints, M.
         attenuation, sharpness: beta and k [1/m].
+        cutoff: The distance beyond which nothing attenuates [m].
         depth: Out: integral of attenuation * sigmoid(-sharpness * d), shape (N, C).
         slopes: Out: where the midpoints that attenuate begin for each ray (N + 1,), which these are (N M,), and the
             derivatives of the integrand by the distances there, times the step, shape (N M, C); (0, 0) when no

@@ -83,7 +83,7 @@ def prepare_target(
     visibility = visibility or settings.visibility
     if visibility == "auto":
         visibility, reason = _choose_visibility(scenes, config)
-        notes.append(reason)
+        notes.append(BackgroundNote(reason))
     target = build_target(scenes, config.space, settings, visibility, compiled=compiled)
     if visibility == "quadrature":
         generator = random_generator(config.seed, "quadrature")
@@ -94,7 +94,7 @@ def prepare_target(
     return target, [
         *notes,
         *resolution_notes(target, settings),
-        *flatness_notes(target, settings.sigma_m, random_generator(config.seed, "flatness")),
+        *flatness_notes(target, random_generator(config.seed, "flatness")),
         *importance_notes(scenes),
         *dict.fromkeys(line for scene in scenes for line in scene.notes),
         *sorted({line for shape in shapes for line in getattr(shape, "notes", ())}),
@@ -107,14 +107,11 @@ def _choose_visibility(scenes: Sequence[Scene], config: RunConfig) -> tuple[str,
     optics = Optics.of(config.density)
     proposals = propose(scenes, config.space, PROBES, optics.sigma_m, generator)
     if not len(proposals.points):
-        reason = "visibility by ray casting, to be safe: no probed ray of the design space meets a target"
-        return "raycast", BackgroundNote(reason)
+        return "raycast", "visibility by ray casting, to be safe: no probed ray of the design space meets a target"
     share = occluded_share(scenes, proposals, optics.margin_m + 3 * optics.sigma_m)
     if share < OCCLUDED_SHARE_TO_CARE:
-        reason = f"visibility off: {share:.2%} of {len(proposals.points)} probed rays had anything in the way"
-        return "off", BackgroundNote(reason)
-    reason = f"visibility by ray casting: {share:.1%} of {len(proposals.points)} probed rays were occluded"
-    return "raycast", BackgroundNote(reason)
+        return "off", f"visibility off: {share:.2%} of {len(proposals.points)} probed rays had anything in the way"
+    return "raycast", f"visibility by ray casting: {share:.1%} of {len(proposals.points)} probed rays were occluded"
 
 
 def refine_quadrature(target: Target, probes: np.ndarray) -> tuple[Target, list[str]]:
@@ -198,12 +195,12 @@ def resolution_notes(target: Target, settings: DensitySettings) -> list[str]:
     ]
 
 
-def flatness_notes(target: Target, sigma_m: float, generator: np.random.Generator) -> list[str]:
+def flatness_notes(target: Target, generator: np.random.Generator) -> list[str]:
     """A note where a sigma wider than the observable region leaves the density flat over uniform points."""
-    points = target.space.sample(FLATNESS_PROBES, generator)
+    points, sigma_m = target.space.sample(FLATNESS_PROBES, generator), target.optics.sigma_m
     if not target.space.free or sigma_m < float(np.linalg.norm(np.ptp(observed_point(points), axis=0))):
         return []
-    varies = float(np.ptp(target.log_proximity(points, sigma_m)))
+    varies = float(np.ptp(target.log_proximity(points)))
     if varies >= FLAT_NATS:
         return []
     return [

@@ -23,6 +23,7 @@ import numpy as np
 
 from lidardesign.config import DensitySettings
 from lidardesign.density.fields.distance import scene_columns
+from lidardesign.density.objective.surfaces import log_peak
 from lidardesign.density.objective.target import Target, build_target
 from lidardesign.numerics import normalised_weights
 from lidardesign.samples import Samples
@@ -61,6 +62,12 @@ def independent_points(target: Target, count: int, generator: np.random.Generato
     return proposals.points, proposals.log_density
 
 
+def independent_samples(target: Target, count: int, generator: np.random.Generator) -> Samples:
+    """`independent_points` with log p* at them; none where no ray of the space comes near a surface."""
+    points, log_density = independent_points(target, count, generator)
+    return Samples(points, log_density, target.log_density(points), target.space)
+
+
 def log_proposal(target: Target, points: np.ndarray) -> np.ndarray | None:
     """log of the density of `independent_points` at points of the space, (N, 6) to (N,), up to the same constant.
 
@@ -75,18 +82,16 @@ def log_proposal(target: Target, points: np.ndarray) -> np.ndarray | None:
 
 
 def _are_resampled(space: DesignSpace) -> bool:
-    both_angles = AZIMUTH in space.free and ELEVATION in space.free
-    return RANGE not in space.free or (not both_angles and len(space.free) <= RESAMPLED_DIMENSIONS)
+    return RANGE not in space.free or (not space.turns and len(space.free) <= RESAMPLED_DIMENSIONS)
 
 
 def _are_drawn_by_surfaces(target: Target) -> bool:
-    free = target.space.free
-    return RANGE in free and AZIMUTH in free and ELEVATION in free and target.surfaces.can_propose
+    return RANGE in target.space.free and target.space.turns and target.surfaces.can_propose
 
 
 def _is_near(target: Target, log_proximity: np.ndarray) -> np.ndarray:
     """The points that come within `FARTHEST_SIGMAS` of a surface, as a mask (N,)."""
-    return log_proximity > target.surfaces.log_peak - FARTHEST_SIGMAS**2 / 2
+    return log_proximity > log_peak(target.surfaces) - FARTHEST_SIGMAS**2 / 2
 
 
 def resampled_proposals(target: Target, count: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -121,9 +126,7 @@ def samples_without_visibility(
         count: The number of draws; those that leave the space are dropped.
         generator: Of all draws.
     """
-    target = build_target(scenes, space, settings, "off")
-    points, log_density = independent_points(target, count, generator)
-    return Samples(points, log_density, target.log_density(points), space)
+    return independent_samples(build_target(scenes, space, settings, "off"), count, generator)
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,10 +155,9 @@ def propose(
     columns = scene_columns(scenes)
     if len(columns) > MAXIMUM_COLUMNS:
         columns = [columns[i] for i in sorted(generator.choice(len(columns), MAXIMUM_COLUMNS, replace=False))]
-    angles_free = AZIMUTH in space.free and ELEVATION in space.free
-    draw = _from_aimed_rays if angles_free else _from_random_rays
+    draw = _from_aimed_rays if space.turns else _from_random_rays
     points, surface_range, column, density = draw(scenes, columns, space, count, spread_m, generator)
-    if angles_free and space.measure == "angles":
+    if space.turns and space.measure == "angles":
         density *= np.cos(points[:, ELEVATION])
     usable = np.flatnonzero(space.contains(points) & (density > 0))
     return ProposedPoints(points[usable], np.log(density[usable]), surface_range[usable], column[usable], columns)

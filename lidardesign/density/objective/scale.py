@@ -70,17 +70,12 @@ class _Sample:
     space: DesignSpace
     generator: np.random.Generator
 
-    @property
-    def aims(self) -> bool:
-        """True where rays can be aimed at points: both angles are free."""
-        return AZIMUTH in self.space.free and ELEVATION in self.space.free
-
     def rays_at(self, blur_m: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
         """Design points (N, 6) that observe points of targets, blurred in all directions, and their columns (N,)."""
         count, parts, of = -(-RAYS // len(self.columns)), [], []
         for number, (index, frame) in enumerate(self.columns):
             scene, points = self.scenes[index], self.space.sample(count, self.generator)
-            if self.aims:
+            if self.space.turns:
                 targets = [body for body in scene.bodies if body.is_target]
                 surface = sample_body(targets, self.space, count, self.generator, frame).points
                 points = aim(points[:, :3], surface + blur_m * self.generator.normal(size=surface.shape))
@@ -235,7 +230,7 @@ def _sigma_notes(sample: _Sample, points: np.ndarray, met: _SampledHits, config:
             f"{high_m:.3g} m{_unit_doubt(least_m, sigma_m)}: so thin a density is hard to learn; {raised}narrow "
             f"space.range_m: what is seen of the targets is {ranges.min():.3g} to {ranges.max():.3g} m away"
         ]
-    return _thin_notes(sample, config, least_m) if sample.aims and least_m > 0 else []
+    return _thin_notes(sample, config, least_m) if sample.space.turns and least_m > 0 else []
 
 
 def _thin_notes(sample: _Sample, config: RunConfig, least_m: float) -> list[str]:

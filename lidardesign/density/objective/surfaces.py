@@ -20,14 +20,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 
 from lidardesign.density.fields.bodies import GROUP_COLUMNS, Bodies, Pairs, occluding_bodies
 from lidardesign.density.fields.distance import Field, scene_columns
 from lidardesign.density.fields.importance import BodyWeights, LogWeights
-from lidardesign.density.objective.visibility import BodyRaycast, Columns, Raycast, Visibility
+from lidardesign.density.objective.visibility import BodyRaycast, Raycast, Visibility
 from lidardesign.numerics import TINY, logsumexp
 from lidardesign.scenes.scene import Scene
 from lidardesign.scenes.surface import sample_body, target_area_m2
@@ -53,61 +52,10 @@ TERM_TOLERANCE_NATS = 16.0
 PROPOSALS_AT_ONCE = 4096
 
 
-class NearSurfaces(Protocol):
-    """The surface terms log w - d^2 / (2 sigma^2) at scene points, for the columns that matter there."""
-
-    columns: Columns
-
-    def log_sums(self, log_transmittance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """log p* at the points from log T of the columns, shape (N,), and the share of each term in it."""
-
-    def gradient(self, shares: np.ndarray) -> np.ndarray:
-        """The gradient of log p* by the points at fixed T, shape (N, 3)."""
-
-
-class Surfaces:
-    """The surfaces that p* is near to, one column per scene and frame.
-
-    `log_column_weights` are the columns' own weights (columns,), `importance` weights the surfaces, `rows_at_once` is
-    the chunk size in points, `grid_steps_m` the grid steps of all meshes, `can_propose` whether `propose` can draw.
-    """
-
-    log_column_weights: np.ndarray
-    importance: LogWeights | None
-    rows_at_once: int
-    grid_steps_m: np.ndarray
-    can_propose: bool
-
-    @property
-    def log_peak(self) -> float:
-        """An upper bound of the surface term of a single column."""
-        return float(self.log_column_weights.max()) + (0.0 if self.importance is None else self.importance.peak)
-
-    def near(self, observed: np.ndarray, sigma_m: float, tolerance_nats: float) -> NearSurfaces:
-        """Surface terms at scene points (N, 3) of the columns within a tolerance of the largest term there."""
-
-    def log_proximity(self, observed: np.ndarray, sigma_m: float, tolerance_nats: float) -> np.ndarray:
-        """log of the sum of surface terms at scene points, (N, 3) to (N,)."""
-
-    def subsample(self, columns: np.ndarray) -> Surfaces:
-        """Some columns alone, weighted to stand for all."""
-
-    def raycast(self, scenes: Sequence[Scene]) -> Visibility:
-        """Ray casting at scenes, for the columns as they are listed here."""
-
-    def propose(
-        self, scenes: Sequence[Scene], space: DesignSpace, count: int, sigma_m: float, generator: np.random.Generator
-    ) -> np.ndarray:
-        """Points (N, 6) inside the space, at most `count`."""
-
-    def log_proposal(
-        self, scenes: Sequence[Scene], space: DesignSpace, points: np.ndarray, sigma_m: float
-    ) -> np.ndarray:
-        """log of the density of `propose` at points (N, 6) of the space, per chart volume up to a constant, (N,)."""
-
-
 @dataclass(frozen=True, eq=False)
 class _NearTable:
+    """The surface terms log w - d^2 / (2 sigma^2) at scene points, for the columns that matter there."""
+
     table: SceneTable
     observed: np.ndarray
     sigma_m: float
@@ -116,6 +64,7 @@ class _NearTable:
     columns: np.ndarray
 
     def log_sums(self, log_transmittance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """log p* at the points from log T of the columns, shape (N,), and the share of each term in it."""
         terms = np.where(self.columns, self.surface + log_transmittance, -np.inf)
         peak = terms.max(axis=1, keepdims=True)
         shares = np.exp(terms - peak)
@@ -124,6 +73,7 @@ class _NearTable:
         return (peak + np.log(total))[:, 0], shares
 
     def gradient(self, shares: np.ndarray) -> np.ndarray:
+        """The gradient of log p* by the points at fixed T, shape (N, 3)."""
         by_point = self.table.field.gradient(self.observed, -shares * self.distances / self.sigma_m**2)
         if self.table.importance is not None:
             by_point += self.table.importance.gradient(self.observed, shares)
@@ -131,8 +81,8 @@ class _NearTable:
 
 
 @dataclass(frozen=True, eq=False)
-class SceneTable(Surfaces):
-    """Every column at every point; see `Surfaces`.
+class SceneTable:
+    """Surfaces of which every column is evaluated at every point.
 
     Arguments:
         field: Distances to the targets.
@@ -147,12 +97,12 @@ class SceneTable(Surfaces):
 
     @property
     def rows_at_once(self) -> int:
-        """See `Surfaces`."""
+        """The chunk size in points."""
         return max(PAIRS_AT_ONCE // len(self.log_column_weights), 1)
 
     @property
     def grid_steps_m(self) -> np.ndarray:
-        """See `Surfaces`."""
+        """The grid steps of all meshes [m]."""
         return self.field.grid_steps_m
 
     def terms(self, observed: np.ndarray, distances: np.ndarray, sigma_m: float) -> np.ndarray:
@@ -160,33 +110,29 @@ class SceneTable(Surfaces):
         terms = self.log_column_weights - np.square(distances / sigma_m) / 2
         return terms if self.importance is None else terms + self.importance.values(observed)
 
-    def near(self, observed: np.ndarray, sigma_m: float, tolerance_nats: float) -> NearSurfaces:
-        """See `Surfaces`; columns are a mask (N, columns)."""
+    def near(self, observed: np.ndarray, sigma_m: float, tolerance_nats: float) -> _NearTable:
+        """Surface terms at scene points (N, 3); columns within a tolerance of the best one are a mask (N, columns)."""
         distances = self.field.distances(observed).astype(np.float64)
         surface = self.terms(observed, distances, sigma_m)
         best = surface.max(axis=1, keepdims=True, initial=-np.inf)
         return _NearTable(self, observed, sigma_m, distances, surface, surface >= best - tolerance_nats)
 
     def log_proximity(self, observed: np.ndarray, sigma_m: float, tolerance_nats: float) -> np.ndarray:
-        """See `Surfaces`; of all columns."""
+        """log of the sum of surface terms at scene points, (N, 3) to (N,), of all columns."""
         distances = self.field.distances(observed).astype(np.float64)
         return logsumexp(self.terms(observed, distances, sigma_m), axis=1)
 
     def subsample(self, columns: np.ndarray) -> SceneTable:
-        """See `Surfaces`; the others stay in the table without weight."""
+        """Some columns alone, weighted to stand for all; the others stay in the table without weight."""
         count = len(self.log_column_weights)
         weights = np.full(count, -np.inf)
         weights[columns] = self.log_column_weights[columns] + np.log(count / len(columns))
         return replace(self, log_column_weights=weights)
 
-    def raycast(self, scenes: Sequence[Scene]) -> Raycast:
-        """See `Surfaces`."""
-        return Raycast(scenes)
-
     def propose(
         self, scenes: Sequence[Scene], space: DesignSpace, count: int, sigma_m: float, generator: np.random.Generator
     ) -> np.ndarray:
-        """See `Surfaces`."""
+        """Points (N, 6) inside the space, at most `count`."""
         columns = scene_columns(scenes)
         column = np.sort(generator.integers(len(columns), size=count))
         surface, normal = np.empty((count, 3)), np.empty((count, 3))
@@ -203,7 +149,7 @@ class SceneTable(Surfaces):
     def log_proposal(
         self, scenes: Sequence[Scene], space: DesignSpace, points: np.ndarray, sigma_m: float
     ) -> np.ndarray:
-        """See `Surfaces`."""
+        """log of the density of `propose` at points (N, 6) of the space, per chart volume up to a constant, (N,)."""
         columns = scene_columns(scenes)
         area_m2 = np.array([target_area_m2(scene, space) for scene in scenes])[[index for index, _ in columns]]
         distances = self.field.distances(observed_point(points)).astype(np.float64)
@@ -248,8 +194,8 @@ class _NearFrames:
 
 
 @dataclass(frozen=True, eq=False)
-class MovingFrames(Surfaces):
-    """Primitives and moving bodies, of which only those columns are evaluated that matter; see `Surfaces`.
+class MovingFrames:
+    """Primitives and moving bodies, of which only those columns are evaluated that matter; methods as of `SceneTable`.
 
     Arguments:
         bodies: The targets, sorted by column.
@@ -263,21 +209,21 @@ class MovingFrames(Surfaces):
 
     @property
     def rows_at_once(self) -> int:
-        """See `Surfaces`."""
+        """See `SceneTable`."""
         return int(np.clip(PAIRS_AT_ONCE // self.bodies.columns, LEAST_ROWS, MOST_ROWS))
 
     @property
     def grid_steps_m(self) -> np.ndarray:
-        """See `Surfaces`."""
+        """See `SceneTable`."""
         return self.bodies.grid_steps_m
 
     @property
     def can_propose(self) -> bool:
-        """See `Surfaces`; planes have no end."""
+        """Whether `propose` can draw: planes have no end."""
         return bool(np.isfinite(self.bodies.low).all())
 
     def near(self, observed: np.ndarray, sigma_m: float, tolerance_nats: float) -> _NearFrames:
-        """See `Surfaces`; columns are pairs."""
+        """See `SceneTable`; columns are pairs."""
         weights, bound_nats = self.log_column_weights, tolerance_nats
         if self.importance is not None:
             # bounds know the most that a column may count, and by how much it may count less
@@ -291,24 +237,20 @@ class MovingFrames(Surfaces):
         return _NearFrames(self, observed, sigma_m, pairs, surface)
 
     def log_proximity(self, observed: np.ndarray, sigma_m: float, tolerance_nats: float) -> np.ndarray:
-        """See `Surfaces`; of the columns that matter."""
+        """See `SceneTable`; of the columns that matter."""
         near = self.near(observed, sigma_m, tolerance_nats)
         return row_log_sums(near.surface, near.columns)[0]
 
     def subsample(self, columns: np.ndarray) -> MovingFrames:
-        """See `Surfaces`; the others are taken away."""
+        """See `SceneTable`; the others are taken away."""
         weights = self.log_column_weights[columns] + np.log(self.bodies.columns / len(columns))
         bodies = self.bodies.take(columns)
         return MovingFrames(bodies, weights, None if self.importance is None else BodyWeights(bodies))
 
-    def raycast(self, scenes: Sequence[Scene]) -> BodyRaycast:
-        """See `Surfaces`."""
-        return BodyRaycast(occluding_bodies(scenes))
-
     def propose(
         self, scenes: Sequence[Scene], space: DesignSpace, count: int, sigma_m: float, generator: np.random.Generator
     ) -> np.ndarray:
-        """See `Surfaces`."""
+        """See `SceneTable`."""
         parts, missing = [], count
         reach_m = np.array(space.low[:3]) - space.high[RANGE], np.array(space.high[:3]) + space.high[RANGE]
         for _ in range(AIMING_ROUNDS):
@@ -326,9 +268,10 @@ class MovingFrames(Surfaces):
     def log_proposal(
         self, scenes: Sequence[Scene], space: DesignSpace, points: np.ndarray, sigma_m: float
     ) -> np.ndarray:
-        """See `Surfaces`."""
+        """See `SceneTable`."""
         # each body has a term of its own, also where several are in one column
-        bodies, weights = self.bodies.apart(), self.log_column_weights[self.bodies.column]
+        count, weights = len(self.bodies), self.log_column_weights[self.bodies.column]
+        bodies = replace(self.bodies, column=np.arange(count), starts=np.arange(count + 1))
         observed, log_density = observed_point(points), np.empty(len(points))
         for start in range(0, len(points), PROPOSALS_AT_ONCE):
             rows = slice(start, min(start + PROPOSALS_AT_ONCE, len(points)))
@@ -377,6 +320,20 @@ class MovingFrames(Surfaces):
             if sum(map(len, accepted)) >= count:
                 break
         return np.concatenate(accepted)[:count]
+
+
+Surfaces = SceneTable | MovingFrames
+
+
+def log_peak(surfaces: Surfaces) -> float:
+    """An upper bound of the surface term of a single column."""
+    importance = surfaces.importance
+    return float(surfaces.log_column_weights.max()) + (0.0 if importance is None else importance.peak)
+
+
+def raycast(surfaces: Surfaces, scenes: Sequence[Scene]) -> Visibility:
+    """Ray casting at scenes, for columns as surfaces list them."""
+    return BodyRaycast(occluding_bodies(scenes)) if isinstance(surfaces, MovingFrames) else Raycast(scenes)
 
 
 def _cumulated(masses: np.ndarray) -> np.ndarray:

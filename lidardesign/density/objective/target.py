@@ -15,11 +15,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lidardesign.config import DensitySettings
-from lidardesign.density.fields.bodies import collect_bodies
 from lidardesign.density.fields.distance import TableField, build_field, scene_columns
-from lidardesign.density.fields.importance import BodyWeights, build_log_weights, is_weighted, weigh
+from lidardesign.density.fields.importance import build_log_weights
 from lidardesign.density.objective.quadrature import Quadrature
-from lidardesign.density.objective.surfaces import MovingFrames, SceneTable, Surfaces
+from lidardesign.density.objective.surfaces import MovingFrames, SceneTable, Surfaces, raycast
 from lidardesign.density.objective.visibility import (
     BistaticVisibility,
     NoVisibility,
@@ -38,8 +37,6 @@ PADDING_SIGMAS = 4.0
 MOST_QUADRATURE_BODIES = 2000
 # d direction / d sin(elevation) grows without bound at the poles; it is capped at this cosine of the elevation.
 MINIMUM_POLE_COSINE = 1e-4
-# Cells per axis are 2 to this power: finer than the points of a batch lie apart.
-LEVELS = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,13 +78,12 @@ class Target:
         """An estimate of p* from some columns alone, weighted to stand for all; the others need no visibility."""
         return replace(self, surfaces=self.surfaces.subsample(columns), visibility=self.visibility.take(columns))
 
-    def log_proximity(self, points: np.ndarray, sigma_m: float | None = None) -> np.ndarray:
+    def log_proximity(self, points: np.ndarray) -> np.ndarray:
         """log of the sum of surface terms at the scene points that design points (N, 6) observe, shape (N,)."""
-        sigma_m = self.optics.sigma_m if sigma_m is None else sigma_m
         observed, values = observed_point(points), np.empty(len(points))
         for start in range(0, len(points), self.rows_at_once):
             rows = slice(start, start + self.rows_at_once)
-            values[rows] = self.surfaces.log_proximity(observed[rows], sigma_m, self.surface_tolerance_nats)
+            values[rows] = self.surfaces.log_proximity(observed[rows], self.optics.sigma_m, self.surface_tolerance_nats)
         return values
 
     def log_density(self, points: np.ndarray, sigma_m: float | None = None) -> np.ndarray:
@@ -107,9 +103,8 @@ class Target:
             raise NumericalError("design points are not finite, or their range_m is negative", where="target density")
         optics = self.optics if sigma_m is None else self.optics.widened(sigma_m)
         values, gradients = np.empty(len(points)), np.empty((len(points) if gradient else 0, 6))
-        size, order = self.rows_at_once, nearby_order(observed_point(points))
-        for start in range(0, len(points), size):
-            rows = order[start : start + size]
+        for start in range(0, len(points), self.rows_at_once):
+            rows = slice(start, start + self.rows_at_once)
             values[rows], by_chart = self._evaluate(points[rows], optics, gradient)
             if gradient:
                 gradients[rows] = by_chart
@@ -139,25 +134,6 @@ class Target:
         return values, by_chart
 
 
-def nearby_order(points: np.ndarray) -> np.ndarray:
-    """The order of points (N, 3) along a Z-shaped curve through their bounding box, shape (N,) (Morton 1966).
-
-    Neighbours in space follow each other and find each other's memory in the cache. Results do not depend on it, to the
-    last bit: every point is evaluated by itself.
-    """
-    if len(points) < 2:
-        return np.arange(len(points))
-    size = np.ptp(points, axis=0)
-    # points that share a coordinate have no extent there
-    shares = (points - points.min(axis=0)) / np.where(size > 0, size, 1.0)
-    cells = np.minimum((shares * 2**LEVELS).astype(np.int64), 2**LEVELS - 1)
-    keys = np.zeros(len(points), dtype=np.int64)
-    for level in range(LEVELS):
-        for axis in range(3):
-            keys |= ((cells[:, axis] >> level) & 1) << (3 * level + axis)
-    return np.argsort(keys, kind="stable")
-
-
 def build_target(
     scenes: Sequence[Scene], space: DesignSpace, settings: DensitySettings, visibility: str, *, compiled: bool = True
 ) -> Target:
@@ -179,32 +155,28 @@ def build_target(
     # meshes at rest are best kept in the table that all scenes at rest share
     at_rest = [body for scene in scenes if scene.frames == 1 for body in scene.bodies if body.is_target]
     tabled = visibility == "quadrature" or any(isinstance(body.shape, Mesh) for body in at_rest)
+    moving = sum(scene.frames * len(scene.bodies) for scene in scenes if scene.frames > 1)
+    if visibility == "quadrature" and moving > MOST_QUADRATURE_BODIES:
+        # every body of thousands of frames would be evaluated at every midpoint
+        raise ConfigError(
+            f"a quadrature over {moving} bodies in all frames would take minutes per step",
+            where="density.visibility",
+            allowed=f"at most {MOST_QUADRATURE_BODIES}",
+            hint="density.visibility=raycast looks only at the frames that matter",
+        )
+    field = build_field(scenes, lambda body: body.is_target, **fields)
+    if isinstance(field, TableField):
+        field = replace(field, compiled=compiled)
+    importance = build_log_weights(scenes, field)
     if common_receiver(scenes) is None and not tabled:
-        bodies = collect_bodies(scenes, lambda body: body.is_target, **fields)
-        importance = None
-        if is_weighted(scenes):
-            entries = [body for scene in scenes for _ in range(scene.frames) for body in scene.bodies if body.is_target]
-            bodies = weigh(bodies, entries)
-            importance = BodyWeights(bodies)
+        bodies = field.bodies if importance is None else importance.bodies
         surfaces: Surfaces = MovingFrames(bodies, log_column_weights, importance)
     else:
-        moving = sum(scene.frames * len(scene.bodies) for scene in scenes if scene.frames > 1)
-        if visibility == "quadrature" and moving > MOST_QUADRATURE_BODIES:
-            # every body of thousands of frames would be evaluated at every midpoint
-            raise ConfigError(
-                f"a quadrature over {moving} bodies in all frames would take minutes per step",
-                where="density.visibility",
-                allowed=f"at most {MOST_QUADRATURE_BODIES}",
-                hint="density.visibility=raycast looks only at the frames that matter",
-            )
-        field = build_field(scenes, lambda body: body.is_target, **fields)
-        if isinstance(field, TableField):
-            field = replace(field, compiled=compiled)
-        surfaces = SceneTable(field, log_column_weights, build_log_weights(scenes, field))
+        surfaces = SceneTable(field, log_column_weights, importance)
     if visibility == "off":
         way: Visibility = NoVisibility()
     elif visibility == "raycast":
-        way = surfaces.raycast(scenes)
+        way = raycast(surfaces, scenes)
     else:
         same = all(body.role == "both" for scene in scenes for body in scene.bodies)
         occluders = field if same else build_field(scenes, lambda body: body.is_occluder, **fields)

@@ -189,16 +189,15 @@ class Blocked:
     @classmethod
     def at(
         cls, log_values: np.ndarray, rays: RayBatch, rows: np.ndarray, index: Any,
-        hits: tuple[np.ndarray, np.ndarray], optics: Optics,
+        hit_m: np.ndarray, normals: np.ndarray, optics: Optics,
     ) -> Blocked:  # fmt: skip
-        """The transmittance of first hits: their ranges (K,) and their normals (K, 3), which face the origins.
+        """The transmittance of first hits.
 
         Arguments:
             log_values: Zeros of the shape that is asked for; written to.
-            rays, rows, index, optics: See the class.
-            hits: One for each of `rows`.
+            rays, rows, index, hit_m, optics: See the class.
+            normals: Of the first hits, facing the origins, shape (K, 3).
         """
-        hit_m, normals = hits
         log_values[index] = -optics.attenuation_per_m * (rays.ranges[rows] - optics.margin_m - hit_m)
         # normals face the origin, so the cosine with the direction is negative
         cosine = np.minimum(np.einsum("pk,pk->p", normals, rays.directions[rows]), -MINIMUM_COSINE)
@@ -260,8 +259,8 @@ class Raycast(Visibility):
         hits = trace_each(self._casters, starts, rays.origins[rows], rays.directions[rows], limit_m)
         blocked = np.flatnonzero(hits.body >= 0)
         rows, hits = rows[blocked], hits.subset(blocked)
-        index, met = (rows, column[blocked]), (hits.range_m, hits.normal)
-        return Blocked.at(np.zeros(columns.shape), rays, rows, index, met, optics)
+        index = rows, column[blocked]
+        return Blocked.at(np.zeros(columns.shape), rays, rows, index, hits.range_m, hits.normal, optics)
 
 
 class BodyRaycast(Visibility):
@@ -287,8 +286,8 @@ class BodyRaycast(Visibility):
         """See `Visibility`; columns are pairs."""
         hit_m, normals = self.first_hits(rays, columns, rays.ranges - optics.margin_m)
         blocked = np.flatnonzero(np.isfinite(hit_m))
-        hits = hit_m[blocked], normals[blocked]
-        return Blocked.at(np.zeros(len(hit_m)), rays, columns.rows[blocked], blocked, hits, optics)
+        zeros, rows = np.zeros(len(hit_m)), columns.rows[blocked]
+        return Blocked.at(zeros, rays, rows, blocked, hit_m[blocked], normals[blocked], optics)
 
     def first_hits(self, rays: RayBatch, pairs: Pairs, limit_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Ranges of first hits before a limit, infinite without one (P,), and normals facing the origin (P, 3)."""
@@ -326,13 +325,14 @@ class BodyRaycast(Visibility):
         for caster, first, last in zip(self._casters, starts[:-1], starts[1:], strict=True):
             origins, directions = local[0][first:last], local[1][first:last]
             limits = np.minimum(limit_m[row[first:last]], hits[pair[first:last]])
-            found, range_m, _, normal = caster.trace(origins, directions, limits)
+            own = caster.trace(origins, directions, limits)
+            found = np.flatnonzero(own.body >= 0)
             # a pair may meet the same mesh in two poses: the nearest is written last
-            farthest = np.argsort(-range_m, kind="stable")
-            found, range_m, normal = found[farthest], range_m[farthest], normal[farthest]
+            found = found[np.argsort(-own.range_m[found], kind="stable")]
+            normal = own.normal[found]
             facing = np.where(np.einsum("pk,pk->p", normal, directions[found]) >= 0, -1.0, 1.0)
             at, turn = first + found, bodies.to_body[body[first + found], :, :3]
-            hits[pair[at]] = range_m
+            hits[pair[at]] = own.range_m[found]
             normals[pair[at]] = np.einsum("pij,pi->pj", turn, facing[:, None] * normal)
 
 

@@ -60,8 +60,7 @@ def load_arrays(run: Path, name: str) -> tuple[dict[str, np.ndarray], dict[str, 
     if FORMAT not in metadata:
         found = ", ".join(sorted(metadata)) or "none"
         ours = found.startswith(FORMAT.rstrip("0123456789"))
-        again = "learn the run again"
-        hint = f"{again}, or use the version of lidardesign that wrote it" if ours else again
+        hint = "learn the run again" + (", or use the version of lidardesign that wrote it" if ours else "")
         raise DataError(f"has the format {found!r}", where=str(path), allowed=FORMAT, hint=hint)
     for key, value in arrays.items():
         if value.dtype.kind == "f" and not np.isfinite(value).all():

@@ -14,16 +14,16 @@ import numpy as np
 import torch
 
 from lidardesign.config import PRESET_LEARNING, RunConfig
-from lidardesign.density.coordinates import Coordinates, on_device, stays_on
+from lidardesign.density.coordinates import Coordinates, DeviceTarget, on_device
 from lidardesign.density.network import DesignFlow
 from lidardesign.density.objective.prepare import prepare_target, training_scenes
-from lidardesign.density.objective.proposals import log_proposal
+from lidardesign.density.objective.proposals import independent_samples, log_proposal
 from lidardesign.density.objective.scale import scale_notes
 from lidardesign.density.objective.target import Target
 from lidardesign.density.objective.visibility import common_receiver
 from lidardesign.density.training.checkpoint import clear_snapshots, save_flow
 from lidardesign.density.training.losses import Pool
-from lidardesign.density.training.quality import IndependentProbes, MeasuredFlow, draw_probes, measure
+from lidardesign.density.training.quality import MeasuredFlow, measure
 from lidardesign.density.training.sampling import (
     KnownPoints,
     LearnedFlow,
@@ -106,8 +106,8 @@ class TrainingData:
     target: Target
     notes: tuple[str, ...]
     pool: Pool
-    independent: IndependentProbes
-    probes: IndependentProbes | None = None
+    independent: Samples
+    probes: Samples | None = None
 
 
 def prepare_training_data(task: Task, config: RunConfig, remark: Callable[[str], None] | None = None) -> TrainingData:
@@ -137,8 +137,9 @@ def prepare_training_data(task: Task, config: RunConfig, remark: Callable[[str],
     target, notes = prepare_target(scenes, config)
     with phase("proposals"):
         # others than those that coverage is measured on
-        independent = draw_probes(target, config.learning.balance_proposals, random_generator(config.seed, "balancing"))
-        if not len(independent.points):
+        generator = random_generator(config.seed, "balancing")
+        independent = independent_samples(target, config.learning.balance_proposals, generator)
+        if not len(independent):
             raise DataError(
                 "no ray of the design space reaches a target surface in any training scene",
                 where="space",
@@ -147,8 +148,8 @@ def prepare_training_data(task: Task, config: RunConfig, remark: Callable[[str],
         refuse_blind_receiver(target.scenes, independent.points)
         # points on the space's faces may leave it by rounding
         unit = config.space.to_unit(independent.points).clip(-1.0, 1.0)
-        pool = Pool.of(unit, independent.log_target, independent.log_proposal)
-        probes = draw_probes(target, STOPPING_POINTS, random_generator(config.seed, "stopping"))
+        pool = Pool.of(unit, independent.log_target, independent.log_prob)
+        probes = independent_samples(target, STOPPING_POINTS, random_generator(config.seed, "stopping"))
     return TrainingData(target, (*task_notes, *of_lengths, *notes), pool, independent, probes)
 
 
@@ -208,7 +209,7 @@ def learn(
             trainer.train(progress)
         learned, generator = trainer.learned(), random_generator(config.seed, "coverage")
         with phase("measuring"):
-            probes = draw_probes(trainer.target, config.learning.coverage_proposals, generator)
+            probes = independent_samples(trainer.target, config.learning.coverage_proposals, generator)
         measured = measure(learned, probes, config.learning.samples)
         found = mix_samples(learned, measured, data, probes)
         with phase("writing"):
@@ -233,9 +234,7 @@ def learn(
 
 
 @phase("mixing")
-def mix_samples(
-    learned: LearnedFlow, measured: MeasuredFlow, data: TrainingData, probes: IndependentProbes
-) -> MixedSamples:
+def mix_samples(learned: LearnedFlow, measured: MeasuredFlow, data: TrainingData, probes: Samples) -> MixedSamples:
     """The samples of a flow with balancing's independent points, in the share of the largest effective number.
 
     Arguments:
@@ -246,21 +245,21 @@ def mix_samples(
     """
     samples, thinning, space = measured.samples, measured.thinning, measured.samples.space
 
-    def known(points: np.ndarray, log_target: np.ndarray, log_density: np.ndarray) -> KnownPoints:
-        log_flow = thinning.log_prob(log_density_of(learned, points), log_target, condition_groups(space, points))
-        return KnownPoints(points, log_flow, log_density, log_target)
+    def known(drawn: Samples) -> KnownPoints:
+        groups = condition_groups(space, drawn.points)
+        log_flow = thinning.log_prob(log_density_of(learned, drawn.points), drawn.log_target, groups)
+        return KnownPoints(drawn.points, log_flow, drawn.log_prob, drawn.log_target)
 
     def of_flow(drawn: Samples) -> KnownPoints | None:
         log_density = log_proposal(data.target, drawn.points)
         return None if log_density is None else KnownPoints(drawn.points, drawn.log_prob, log_density, drawn.log_target)
 
     kept = of_flow(samples)
-    if kept is None or min(len(kept), len(probes.points), len(data.independent.points)) < FEWEST_PROBES:
+    if kept is None or min(len(kept), len(probes), len(data.independent)) < FEWEST_PROBES:
         return MixedSamples.of_flow_alone(samples)
     pilot = of_flow(thinning.thinned(draw_samples(learned, PILOTS), learned.generator))
-    others = known(*(values[:PILOTS] for values in (probes.points, probes.log_target, probes.log_proposal)))
-    pool = known(data.independent.points, data.independent.log_target, data.independent.log_proposal)
-    return mixed(samples, kept, pool, (pilot, others))
+    others = known(probes.subset(slice(PILOTS)))
+    return mixed(samples, kept, known(data.independent), (pilot, others))
 
 
 @contextlib.contextmanager
@@ -296,7 +295,7 @@ def draft_note(measured: Sequence[tuple[int, Estimate]], preset: str) -> str | N
 
 
 def _notes(trainer: Trainer, place: torch.device, preset: str) -> list[str]:
-    notes = [] if stays_on(trainer.target, place) else [ON_PROCESSOR]
+    notes = [] if place.type == "cpu" or isinstance(trainer.target, DeviceTarget) else [ON_PROCESSOR]
     if trainer.skipped:
         notes.append(f"{trainer.skipped} steps were skipped: their loss or gradient was not finite")
     if trainer.doubled_at is not None:

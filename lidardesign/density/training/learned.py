@@ -26,7 +26,7 @@ from lidardesign.density.objective.visibility import Optics
 from lidardesign.density.training.checkpoint import load_arrays, stored_snapshots
 from lidardesign.density.training.learn import FLOW, make_flow, training_scenes
 from lidardesign.density.training.losses import Pool, balancing_loss, pathwise_loss
-from lidardesign.density.training.quality import IndependentProbes, measure
+from lidardesign.density.training.quality import measure
 from lidardesign.density.training.sampling import LearnedFlow, Thinning, condition_groups, draw_samples, log_density_of
 from lidardesign.density.training.trainer import PROGRESS, SIGMA_START_RATIO
 from lidardesign.errors import ConfigError, DataError
@@ -34,6 +34,7 @@ from lidardesign.estimates import Estimate
 from lidardesign.numerics import TINY
 from lidardesign.run.inputs import RECORD, read_file
 from lidardesign.run.manifest import verify
+from lidardesign.samples import Samples
 from lidardesign.space import DesignSpace
 from lidardesign.task import Task
 
@@ -64,7 +65,7 @@ def check_kept(run: Path) -> None:
 
 
 def remeasured(
-    run: Path, config: RunConfig, target: Target, probes: IndependentProbes, *, count: int, seed: int
+    run: Path, config: RunConfig, target: Target, probes: Samples, *, count: int, seed: int
 ) -> list[SnapshotQuality]:
     """The figures of every snapshot of a run and of its flow, in the order of steps.
 

@@ -30,8 +30,6 @@ import numpy as np
 import torch
 from scipy.optimize import brentq
 
-from lidardesign.density.objective.proposals import independent_points
-from lidardesign.density.objective.target import Target
 from lidardesign.density.training.losses import TOLERANCE_NATS, round_trip_nats
 from lidardesign.density.training.sampling import (
     CONDITION_GROUPS,
@@ -108,10 +106,8 @@ def coverage(
 ) -> Estimate:
     """The covered share of the target's mass, from proposals with their three log densities, shapes (N,).
 
-    With conditions `log_z` has the value of each proposal's condition group, shape (N,). No proposals cover nothing.
+    With conditions `log_z` has the value of each proposal's condition group, shape (N,).
     """
-    if not len(log_target):
-        return Estimate(0.0, None)
     log_mass = log_target - log_proposal
     mass = np.exp(log_mass - log_mass.max())
     covered = log_prob >= log_target - log_z + math.log(COVERED_RATIO)
@@ -226,21 +222,6 @@ NOT_COVERED = (
 
 
 @dataclass(frozen=True, eq=False)
-class IndependentProbes:
-    """Points drawn independently of a flow.
-
-    Arguments:
-        points: Design points inside the space, shape (N, 6).
-        log_proposal: log of the density that they were drawn from, up to a constant, shape (N,).
-        log_target: log p* at them, shape (N,).
-    """
-
-    points: np.ndarray
-    log_proposal: np.ndarray
-    log_target: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
 class MeasuredFlow:
     """Fresh samples of a flow, and its figures with their errors.
 
@@ -259,16 +240,11 @@ class MeasuredFlow:
     notes: tuple[str, ...] = ()
 
 
-def draw_probes(target: Target, count: int, generator: np.random.Generator) -> IndependentProbes:
-    """At most `count` probes of a target; none where no ray of the space comes near a surface."""
-    points, log_proposal = independent_points(target, count, generator)
-    log_target = target.log_density(points) if len(points) else log_proposal
-    return IndependentProbes(points, log_proposal, log_target)
-
-
 @phase("measuring")
-def measure(learned: LearnedFlow, probes: IndependentProbes, count: int) -> MeasuredFlow:
+def measure(learned: LearnedFlow, probes: Samples, count: int) -> MeasuredFlow:
     """The density that `count` fresh samples of a flow are thinned to, and its figures from these and from probes.
+
+    Probes are drawn independently of the flow, and the density that they are drawn from is known up to a constant.
 
     Raises:
         NumericalError: A sample has no finite weight.
@@ -282,13 +258,12 @@ def measure(learned: LearnedFlow, probes: IndependentProbes, count: int) -> Meas
     groups = condition_groups(space, samples.points)
     figures, covered = quality(samples.log_prob, samples.log_target, groups), Estimate(0.0, None)
     sides = samples.log_weights, samples.log_weights, samples.log_weights, groups, groups
-    if len(probes.points):
+    if len(probes):
         theirs = condition_groups(space, probes.points)
         log_prob = thinning.log_prob(log_density_of(learned, probes.points), probes.log_target, theirs)
         log_z = _log_z_at(probes.points, samples, groups, figures["log_z"].value)
-        covered = coverage(log_prob, probes.log_target, probes.log_proposal, log_z)
-        log_weights = probes.log_target - probes.log_proposal
-        sides = samples.log_weights, probes.log_target - log_prob, log_weights, groups, theirs
+        covered = coverage(log_prob, probes.log_target, probes.log_prob, log_z)
+        sides = samples.log_weights, probes.log_target - log_prob, probes.log_weights, groups, theirs
     else:
         notes.append(NOT_COVERED)
     estimates = worse_of(figures, overlap(*sides)) | {"coverage": covered}

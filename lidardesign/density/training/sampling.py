@@ -317,7 +317,8 @@ def mixed(
     """Samples of a flow with as many independent points as give the largest effective size, or none.
 
     Arguments:
-        samples: Of the flow; `kept` says both densities there.
+        samples: Of the flow.
+        kept: The same points with both densities.
         pool: Independent points.
         pilots: Other draws of both, by which the share is chosen.
     """

@@ -50,7 +50,7 @@ from lidardesign.density.training.checkpoint import (
     snapshot_name,
 )
 from lidardesign.density.training.losses import TOLERANCE_NATS, Pool, balancing_loss, pathwise_loss, round_trip_nats
-from lidardesign.density.training.quality import IndependentProbes, measure
+from lidardesign.density.training.quality import measure
 from lidardesign.density.training.sampling import LearnedFlow
 from lidardesign.errors import DivergenceError, NumericalError
 from lidardesign.estimates import Estimate
@@ -59,6 +59,7 @@ from lidardesign.run.clock import phase
 from lidardesign.run.files import append_line, write_atomic
 from lidardesign.run.inputs import RECORD, read_file
 from lidardesign.run.manifest import record
+from lidardesign.samples import Samples
 
 # How much of the means of gradients and of their squares a step keeps.
 BETAS = (0.9, 0.99)
@@ -189,7 +190,7 @@ class Trainer(LearnedFlow):
     settings: LearningSettings
     run: Path
     pool: Pool
-    probes: IndependentProbes | None = None
+    probes: Samples | None = None
     is_over: Callable[[Trainer], bool] | None = None
     step: int = 0
     stopped: bool = False
@@ -260,7 +261,8 @@ class Trainer(LearnedFlow):
                 loss, ess = self._advance()
                 if is_snapshot(self.step, self.settings):
                     save_flow(self.average, self.run, snapshot_name(self.step), step=self.step)
-                is_last = self._is_over() or self.step == self.settings.steps
+                is_over = self._may_stop and self.is_over is not None and self.is_over(self)
+                is_last = is_over or self.step == self.settings.steps
                 reached = self._reached(is_last)
                 goal = self.settings.misplaced
                 is_good = bool(reached and goal) and reaches(self.measured[-1][1], goal)
@@ -275,7 +277,7 @@ class Trainer(LearnedFlow):
 
     def _reached(self, is_last: bool) -> dict[str, float]:
         """Measure the misplaced share after each stretch of balancing and at the end; keep the best average."""
-        if self.probes is None or len(self.probes.points) < FEWEST_PROBES or not self._may_stop:
+        if self.probes is None or len(self.probes) < FEWEST_PROBES or not self._may_stop:
             return {}
         if self.balanced_steps % STRETCH and not is_last:
             return {}
@@ -294,9 +296,6 @@ class Trainer(LearnedFlow):
     @property
     def _may_stop(self) -> bool:
         return self.balanced_steps >= least_balancing_steps(self.settings.pathwise_steps)
-
-    def _is_over(self) -> bool:
-        return self.is_over is not None and self._may_stop and self.is_over(self)
 
     def _report(
         self,
@@ -444,7 +443,7 @@ class Trainer(LearnedFlow):
         self._restore_arrays(arrays)
         self.generator.set_state(torch.as_tensor(arrays["generator"]))
         for name in (*COUNTERS, "stopped", "least_misplaced"):
-            setattr(self, name, state[name])
+            setattr(self, name, state.get(name))
         self.seconds_before, self._started = state["seconds"], time.perf_counter()
         clear_snapshots(self.run, beyond=self.step)
         path = self.run / PROGRESS

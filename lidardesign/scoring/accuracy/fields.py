@@ -21,7 +21,7 @@ from lidardesign.density.fields.distance import BodyField, Field, TableField, sc
 from lidardesign.density.fields.grids import distance_grid, grid_around
 from lidardesign.density.fields.importance import build_log_weights
 from lidardesign.density.objective.quadrature import Quadrature
-from lidardesign.density.objective.surfaces import SceneTable
+from lidardesign.density.objective.surfaces import SceneTable, raycast
 from lidardesign.density.objective.target import PADDING_SIGMAS, Target, build_target
 from lidardesign.density.objective.visibility import Columns, NoVisibility, Optics, RayBatch, Unmoved, Visibility
 from lidardesign.numerics import logsumexp
@@ -116,7 +116,7 @@ class FieldCase:
         frames = np.array([few[index].frames for index, _ in scene_columns(few)], dtype=np.float64)
         field = fresh(few, scenes, settings.field_resolution, settings)
         surfaces = SceneTable(field, -np.log(frames), build_log_weights(few, field))
-        way = NoVisibility() if visibility == "off" else surfaces.raycast(few)
+        way = NoVisibility() if visibility == "off" else raycast(surfaces, few)
         target = Target(
             tuple(few), surfaces, way, Optics.of(settings), space, settings.surface_tolerance_nats
         ).with_visibility(way)
@@ -339,7 +339,8 @@ class VisibilityCase:
 
     def measure(self, setting: str, target: Target, exact: np.ndarray, *, default: bool) -> Measurement:
         """A target's error at as many probes as there are exact values (N,), and its time for a batch."""
-        probes, batch = self.probes.first(len(exact)), self.probes.points[: self.batch]
+        probes = Probes(self.probes.points[: len(exact)], self.probes.log_proposal[: len(exact)])
+        batch = self.probes.points[: self.batch]
         target.log_density_and_gradient(batch[:WARM_UP_PROBES])
         _, seconds, memory = timed(lambda: target.log_density_and_gradient(batch))
         errors = probes.misplaced(target.log_density(probes.points), exact)
@@ -348,7 +349,7 @@ class VisibilityCase:
 
 def opaque_target(target: Target) -> Target:
     """The same target with opaque occluders."""
-    return target.with_visibility(Opaque(target.surfaces.raycast(target.scenes)))
+    return target.with_visibility(Opaque(raycast(target.surfaces, target.scenes)))
 
 
 class Opaque(Visibility):

@@ -85,10 +85,6 @@ class Probes:
     points: np.ndarray
     log_proposal: np.ndarray
 
-    def first(self, count: int) -> Probes:
-        """The first of them, at most `count`."""
-        return Probes(self.points[:count], self.log_proposal[:count])
-
     def misplaced(self, log_target: np.ndarray, log_reference: np.ndarray) -> tuple[float, float]:
         """The share of mass in the wrong place and its standard error, from log p* at the points, shapes (N,)."""
         return misplaced_share(log_target, log_reference, self.log_proposal)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from lidardesign.density.objective.proposals import independent_samples
 from lidardesign.density.training.learned import (
     DTYPES,
     LearningSteps,
@@ -17,7 +18,6 @@ from lidardesign.density.training.learned import (
     noise_shares,
     remeasured,
 )
-from lidardesign.density.training.quality import draw_probes as draw_independent_probes
 from lidardesign.scoring.accuracy.probes import AccuracyRequest, density_sweep
 from lidardesign.scoring.sweep import Measurement, Sweep, timed
 from lidardesign.task import random_generator
@@ -44,7 +44,7 @@ FRAMES_BATCHES, DRAWS = 32, 1
 def steps_sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
     """The misplaced share after a part of the steps: of the run's own snapshots and of the flow that it learned."""
     seed, target = request.config.seed, request.target
-    probes = draw_independent_probes(target, PROBES, random_generator(seed, "accuracy", "training"))
+    probes = independent_samples(target, PROBES, random_generator(seed, "accuracy", "training"))
     reached = remeasured(request.run, request.config, target, probes, count=SAMPLES, seed=seed)
     measurements = []
     for one in reached:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -86,54 +86,27 @@ class Candidate(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class BaselineLayout:
-    """A layout whose rays all have one gate.
+    """A layout of any number of rays.
 
     Arguments:
         name: For messages.
-        place: Even or random points (x, y, z, azimuth, elevation) of any number, (count, site) to (count, 5).
-        gate_m: The gate of all its rays, shape (2,).
+        lay_out: Points (x, y, z, azimuth, elevation) of any number, and their gates or the one of all of them [m]:
+            (count, site) to (count, 5), and (count, 2) or (2,).
         drawn_anew: Whether the points differ from scene to scene.
     """
 
     name: str
-    place: Callable[[int, LayoutSite], np.ndarray]
-    gate_m: np.ndarray
-    drawn_anew: bool = False
-
-    def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> RaysPerCondition:
-        """See `Candidate`."""
-        sites = (LayoutSite(space, number, scene) for number, space in enumerate(spaces))
-        return tuple(rays_at(self.place(count, site), self.gate_m) for site in sites)
-
-    def positions_within(
-        self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth
-    ) -> RaysPerCondition | None:
-        """See `Candidate`."""
-        count = rays_within(limit_mbps, bandwidth, self.gate_m)
-        return self.positions(spaces, count) if count <= MOST_RAYS else None
-
-
-@dataclass(frozen=True, eq=False)
-class GatedLayout:
-    """A layout whose rays have gates of their own, or those of their site.
-
-    Arguments:
-        name: For messages.
-        lay_out: Points (x, y, z, azimuth, elevation) of any number and their gates [m]:
-            (count, site) to (count, 5) and (count, 2).
-    """
-
-    name: str
     lay_out: Callable[[int, LayoutSite], tuple[np.ndarray, np.ndarray]]
-    drawn_anew: ClassVar[bool] = False
+    drawn_anew: bool = False
     _known: dict[tuple[DesignSpace, int], Rays] = field(default_factory=dict, repr=False)
 
     def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> RaysPerCondition:
         """See `Candidate`."""
+        known = {} if self.drawn_anew else self._known
         for number, space in enumerate(spaces):
-            if (space, count) not in self._known:
-                self._known[space, count] = rays_at(*self.lay_out(count, LayoutSite(space, number)))
-        return tuple(self._known[space, count] for space in spaces)
+            if (space, count) not in known:
+                known[space, count] = rays_at(*self.lay_out(count, LayoutSite(space, number, scene)))
+        return tuple(known[space, count] for space in spaces)
 
     def positions_within(
         self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth

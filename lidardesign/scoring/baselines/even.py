@@ -16,12 +16,12 @@ from functools import cache, partial
 import numpy as np
 
 from lidardesign.numerics import TINY, unit_vectors
-from lidardesign.scoring.baselines.candidates import GatedLayout, LayoutSite, opened_gate
-from lidardesign.scoring.baselines.views import RAY_AXES, Observed, ReturnTable, TrainingViews, dense_rays
+from lidardesign.scoring.baselines.candidates import BaselineLayout, LayoutSite, opened_gate
+from lidardesign.scoring.baselines.views import RAY_AXES, ReturnTable, TrainingViews, dense_rays
 from lidardesign.sensors.bandwidth import split_budget
 from lidardesign.sensors.pattern import grid_rows, grid_tangent, low_discrepancy
 from lidardesign.sensors.sensor import boresight_frame
-from lidardesign.space import AZIMUTH, ELEVATION, FULL_TURN, RANGE, DesignSpace, angles, direction
+from lidardesign.space import AZIMUTH, ELEVATION, FULL_TURN, RANGE, DesignSpace, angles, direction, observed_point
 
 # The projection's radius of the direction opposite to its middle.
 OPPOSITE = 2.0
@@ -269,7 +269,7 @@ def even_placement(low: np.ndarray, high: np.ndarray, count: int, field: SphereF
     return np.clip(points, low, high)
 
 
-def bounding(views: TrainingViews, *, gates_per_ray: bool = False) -> list[GatedLayout]:
+def bounding(views: TrainingViews, *, gates_per_ray: bool = False) -> list[BaselineLayout]:
     """The layouts of the baseline: what an engineer would build in five minutes from the training returns.
 
     One even layout, cropped to the central 99 % of the returns in direction and range. Where both angles are free, the
@@ -308,7 +308,7 @@ class Crop:
     table: Callable[[], ReturnTable]
 
 
-CropOf = Callable[[TrainingViews, DesignSpace, Observed], Crop | None]
+CropOf = Callable[[TrainingViews, DesignSpace, np.ndarray], Crop | None]
 
 
 def crop_kinds(space: DesignSpace) -> dict[str, CropOf]:
@@ -317,13 +317,13 @@ def crop_kinds(space: DesignSpace) -> dict[str, CropOf]:
     return {"parallel": _parallel_crop, "cropped": box_crop} if origins else {"cropped": box_crop}
 
 
-def _cropped(name: str, views: TrainingViews, crop_of: CropOf, gates_per_ray: bool) -> list[GatedLayout]:
+def _cropped(name: str, views: TrainingViews, crop_of: CropOf, gates_per_ray: bool) -> list[BaselineLayout]:
     """The layouts of a kind of crop; empty without returns."""
 
     @cache
     def crop_at(space: DesignSpace) -> Crop | None:
         observed = views.observed(space)
-        return crop_of(views, space, observed) if len(observed.points) else None
+        return crop_of(views, space, observed) if len(observed) else None
 
     everywhere = crop_at(views.space)
     if everywhere is None:
@@ -337,29 +337,30 @@ def _cropped(name: str, views: TrainingViews, crop_of: CropOf, gates_per_ray: bo
         points = even_placement(low, high, count, crop.directions)
         return points, crop.table().gates(points, TAIL, 0.0) if per_ray else np.tile(crop.gate_m, (count, 1))
 
-    gated = [GatedLayout(f"{name}, a gate per ray", partial(lay_out, per_ray=True))] if gates_per_ray else []
-    return [GatedLayout(name, lay_out), *gated]
+    gated = [BaselineLayout(f"{name}, a gate per ray", partial(lay_out, per_ray=True))] if gates_per_ray else []
+    return [BaselineLayout(name, lay_out), *gated]
 
 
-def box_crop(views: TrainingViews, space: DesignSpace, observed: Observed) -> Crop:
+def box_crop(views: TrainingViews, space: DesignSpace, observed: np.ndarray) -> Crop:
     """The central 99 % of returns in origin, direction and range."""
-    low, high = central_interval(observed.points)
+    low, high = central_interval(observed)
     directions = None
     if {AZIMUTH, ELEVATION} <= set(space.free) - set(space.conditioned):
-        directions = central_field(space, observed.points[:, AZIMUTH], observed.points[:, ELEVATION])
+        directions = central_field(space, observed[:, AZIMUTH], observed[:, ELEVATION])
     gate_m = opened_gate(low[RANGE], high[RANGE])
     low, high = low[:RAY_AXES], high[:RAY_AXES]
     return Crop(low, high, directions, gate_m, _dense_table(views, low, high, directions))
 
 
-def _parallel_crop(views: TrainingViews, space: DesignSpace, observed: Observed) -> Crop | None:
+def _parallel_crop(views: TrainingViews, space: DesignSpace, observed: np.ndarray) -> Crop | None:
     """Parallel rays from an even grid over the returns' box, within the admissible origins.
 
     An origin axis that runs along the rays stays at the bound behind the scene. None where such rays return nothing.
     """
     azimuth, elevation = parallel_angles(space, observed)
     looking = direction(azimuth, elevation)
-    low, high = (np.clip(end, space.low[:3], space.high[:3]) for end in central_interval(observed.hits_m))
+    hits_m = observed_point(observed)
+    low, high = (np.clip(end, space.low[:3], space.high[:3]) for end in central_interval(hits_m))
     for axis in np.flatnonzero(np.abs(looking) > ALIGNED):
         low[axis] = high[axis] = space.low[axis] if looking[axis] > 0 else space.high[axis]
     low, high = np.append(low, [azimuth, elevation]), np.append(high, [azimuth, elevation])
@@ -370,11 +371,11 @@ def _parallel_crop(views: TrainingViews, space: DesignSpace, observed: Observed)
     return Crop(low, high, None, opened_gate(*central_interval(ranges)), table)
 
 
-def parallel_angles(space: DesignSpace, observed: Observed) -> tuple[float, float]:
+def parallel_angles(space: DesignSpace, observed: np.ndarray) -> tuple[float, float]:
     """Azimuth and elevation of parallel rays: straight down if admitted, else up, else the returns' median [rad]."""
-    middle = np.median(observed.points[:, AZIMUTH])
+    middle = np.median(observed[:, AZIMUTH])
     vertical = [end for end in (-math.pi / 2, math.pi / 2) if space.low[ELEVATION] <= end <= space.high[ELEVATION]]
-    return float(middle), vertical[0] if vertical else float(np.median(observed.points[:, ELEVATION]))
+    return float(middle), vertical[0] if vertical else float(np.median(observed[:, ELEVATION]))
 
 
 def _dense_table(

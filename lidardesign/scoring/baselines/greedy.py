@@ -162,7 +162,7 @@ class GreedyCandidate:
 
     def _crops(self, space: DesignSpace) -> list[Crop]:
         observed = self.views.observed(space)
-        crops = [crop_of(self.views, space, observed) for crop_of in crop_kinds(space).values() if len(observed.points)]
+        crops = [crop_of(self.views, space, observed) for crop_of in crop_kinds(space).values() if len(observed)]
         return [crop for crop in crops if crop is not None]
 
     def _returning(self, crop: Crop, count: int) -> np.ndarray:

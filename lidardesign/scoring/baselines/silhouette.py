@@ -25,7 +25,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from lidardesign.numerics import TINY, unit_vectors
-from lidardesign.scoring.baselines.candidates import GatedLayout, LayoutSite
+from lidardesign.scoring.baselines.candidates import BaselineLayout, LayoutSite
 from lidardesign.scoring.baselines.even import SIXTH, SphereField, box_crop, even_placement, widened_angles
 from lidardesign.scoring.baselines.views import RAY_AXES, ReturnTable, TrainingViews, dense_rays
 from lidardesign.sensors.pattern import low_discrepancy
@@ -64,7 +64,7 @@ def survey(views: TrainingViews, space: DesignSpace) -> Survey | None:
     low[:AZIMUTH] = high[:AZIMUTH] = middle[:AZIMUTH]
     space = replace(space, low=tuple(low.tolist()), high=tuple(high.tolist()))
     observed = views.observed(space)
-    if not len(observed.points):
+    if not len(observed):
         return None
     crop = box_crop(views, space, observed)
     directions = None if crop.directions is None else crop.directions.widened(WIDER, space)
@@ -79,17 +79,17 @@ def survey(views: TrainingViews, space: DesignSpace) -> Survey | None:
 PlaceRays = Callable[[Survey, int], np.ndarray]
 
 
-def silhouette(views: TrainingViews) -> list[GatedLayout]:
+def silhouette(views: TrainingViews) -> list[BaselineLayout]:
     """The layout; none where dense rays return nothing."""
     return _layouts("silhouette", views, lattice_rays, 0.0, SILHOUETTE_SIGMAS)
 
 
-def lloyd(views: TrainingViews) -> list[GatedLayout]:
+def lloyd(views: TrainingViews) -> list[BaselineLayout]:
     """The layout; none where dense rays return nothing."""
     return _layouts("lloyd", views, _lloyd_rays, LLOYD_TAIL, LLOYD_SIGMAS)
 
 
-def _layouts(name: str, views: TrainingViews, place: PlaceRays, tail: float, sigmas: float) -> list[GatedLayout]:
+def _layouts(name: str, views: TrainingViews, place: PlaceRays, tail: float, sigmas: float) -> list[BaselineLayout]:
     survey_at = cache(partial(survey, views))
     everywhere = survey_at(views.space)
     if everywhere is None:
@@ -103,7 +103,7 @@ def _layouts(name: str, views: TrainingViews, place: PlaceRays, tail: float, sig
             points[:, axis] = np.clip(points[:, axis], site.space.low[axis], site.space.high[axis])
         return points, gates
 
-    return [GatedLayout(name, lay_out)]
+    return [BaselineLayout(name, lay_out)]
 
 
 def lattice_rays(found: Survey, count: int) -> np.ndarray:

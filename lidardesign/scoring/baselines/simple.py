@@ -160,23 +160,25 @@ def _keyed(name: str, options: Sequence[Option]) -> list[tuple[tuple[str, str, i
 
 
 def _uniform(source: Baselines) -> list[Candidate]:
-    def place(count: int, site: LayoutSite) -> np.ndarray:
-        return even_placement(site.space.low[:RAY_AXES], site.space.high[:RAY_AXES], count)
+    def lay_out(count: int, site: LayoutSite) -> tuple[np.ndarray, np.ndarray]:
+        points = even_placement(site.space.low[:RAY_AXES], site.space.high[:RAY_AXES], count)
+        return points, whole_range(source.space)
 
-    return [BaselineLayout("even", place, whole_range(source.space))]
+    return [BaselineLayout("even", lay_out)]
 
 
 def _random(source: Baselines) -> list[Candidate]:
-    def place(count: int, site: LayoutSite) -> np.ndarray:
+    def lay_out(count: int, site: LayoutSite) -> tuple[np.ndarray, np.ndarray]:
         # the first position draws what a space without conditions draws
         later = [site.number] if site.number else []
-        return site.space.sample(count, random_generator(source.seed, "random baseline", count, site.scene, *later))
+        generator = random_generator(source.seed, "random baseline", count, site.scene, *later)
+        return site.space.sample(count, generator), whole_range(source.space)
 
-    return [BaselineLayout("random", place, whole_range(source.space), drawn_anew=True)]
+    return [BaselineLayout("random", lay_out, drawn_anew=True)]
 
 
 def _greedy(source: Baselines) -> list[Candidate]:
-    return [source.chosen(source.views)] if len(source.views.observed(source.space).points) else []
+    return [source.chosen(source.views)] if len(source.views.observed(source.space)) else []
 
 
 def _occupancy(source: Baselines) -> list[Candidate]:
@@ -286,18 +288,18 @@ def occupancy(space: DesignSpace, train: Sequence[Scene], seed: int) -> Baseline
     if not len(points):
         return None
     drawn = random_generator(seed, "occupancy gate").choice(len(points), GATE_POINTS, p=weights / weights.sum())
-    nearest, furthest = central_interval(points[drawn, RANGE])
+    gate_m = opened_gate(*central_interval(points[drawn, RANGE]))
     known: dict[int, AimedPoints] = {}
 
-    def place(count: int, site: LayoutSite) -> np.ndarray:
+    def lay_out(count: int, site: LayoutSite) -> tuple[np.ndarray, np.ndarray]:
         aimed = known.setdefault(site.number, AimedPoints(grid, site.space, seed, 1 + site.number))
         generator = random_generator(seed, "occupancy baseline", count, site.scene, site.number)
         found, weights = aimed.first(POINTS_PER_RAY * count)
         if not len(found):
-            return site.space.sample(count, generator)
-        return found[generator.choice(len(found), count, p=weights / weights.sum())]
+            return site.space.sample(count, generator), gate_m
+        return found[generator.choice(len(found), count, p=weights / weights.sum())], gate_m
 
-    return BaselineLayout("occupancy", place, opened_gate(float(nearest), float(furthest)), drawn_anew=True)
+    return BaselineLayout("occupancy", lay_out, drawn_anew=True)
 
 
 def occupancy_grid(scenes: Sequence[Scene], space: DesignSpace, seed: int) -> OccupancyGrid:

@@ -18,7 +18,7 @@ from lidardesign.sensors.pattern import low_discrepancy
 from lidardesign.simulate.detector.physics import Physics
 from lidardesign.simulate.plan import Planner
 from lidardesign.simulate.returns import build_casters
-from lidardesign.space import AZIMUTH, ELEVATION, FULL_TURN, RANGE, DesignSpace, direction, observed_point
+from lidardesign.space import AZIMUTH, ELEVATION, FULL_TURN, RANGE, DesignSpace, direction
 from lidardesign.task import Metric, Task
 
 RAY_AXES = 5  # x, y, z, azimuth, elevation: everything but the range
@@ -26,19 +26,6 @@ RAY_AXES = 5  # x, y, z, azimuth, elevation: everything but the range
 # Per scene and frame, over several axes or over one: the ends of the central 99 % then rest on a few rays in each.
 DENSE_RAYS, DENSE_RAYS_ON_A_LINE = 4096, 256
 MOST_VIEWS = 128  # scenes times frames that are looked at: evenly spread where there are more
-
-
-@dataclass(frozen=True, eq=False)
-class Observed:
-    """Returns of rays on targets.
-
-    Arguments:
-        points: Design points with a return, the azimuth unrolled to one arc, shape (K, 6).
-        hits_m: Where they hit, shape (K, 3).
-    """
-
-    points: np.ndarray
-    hits_m: np.ndarray
 
 
 FLATTEST_COSINE = 0.1  # a surface counts as seen no more flatly
@@ -147,20 +134,23 @@ class TrainingViews:
 
     def __init__(self, space: DesignSpace, train: Sequence[Scene]) -> None:
         self.space, self.train = space, train
-        self._observed: dict[DesignSpace, Observed] = {}
+        self._observed: dict[DesignSpace, np.ndarray] = {}
 
     @cached_property
     def casters(self) -> list[tuple[Scene, SceneCaster]]:
         """A caster per scene and frame, built once."""
         return [(self.train[i], SceneCaster(self.train[i], frame)) for i, frame in spread_frames(self.train)]
 
-    def observed(self, space: DesignSpace) -> Observed:
-        """Returns of dense rays over a part of the design space, even in its own measure, traced once."""
+    def observed(self, space: DesignSpace) -> np.ndarray:
+        """Design points of dense rays over a part of the design space, even in its own measure, that return; (K, 6).
+
+        They are traced once; azimuths are unrolled to one arc.
+        """
         if space not in self._observed:
             self._observed[space] = self._traced(space)
         return self._observed[space]
 
-    def _traced(self, space: DesignSpace) -> Observed:
+    def _traced(self, space: DesignSpace) -> np.ndarray:
         axes = [i for i, dimension in enumerate(space.free) if dimension != RANGE]
         count = dense_rays(len(axes))
         unit = np.full((count, len(space.free)), -1.0)
@@ -168,10 +158,9 @@ class TrainingViews:
         table = self.returns(space.from_unit(unit))
         view, ray = np.nonzero(table.returned)
         design = np.column_stack([table.points[ray], table.range_m[view, ray]])
-        hits_m = observed_point(design)
         if self.space.full_azimuth:
             design[:, AZIMUTH] = unrolled(design[:, AZIMUTH])
-        return Observed(design, hits_m)
+        return design
 
     def returns(self, points: np.ndarray) -> ReturnTable:
         """Returns of rays (N, 5 or 6) on targets inside the space's range, ray by ray and view by view."""

@@ -8,7 +8,6 @@ whole capture.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from enum import IntEnum
 
@@ -21,10 +20,8 @@ from lidardesign.numerics import EPSILON
 from lidardesign.scenes.rays import Rays
 from lidardesign.scoring.baselines.even import quasi_random_points
 from lidardesign.scoring.captures.capture import Capture
-from lidardesign.simulate.detector.physics import FWHM_PER_SIGMA, Estimator
+from lidardesign.simulate.detector.physics import FWHM_PER_SIGMA, Estimator, chunks
 
-# Histograms are worked on so many bins at a time, which bounds memory at some 150 MB.
-CHUNK_BINS = 1 << 22
 # A ray that starts further from the scanner than this was not captured: it sees other surfaces.
 SAME_PLACE_M = 0.005
 
@@ -186,7 +183,7 @@ def measured(
         )
     pulse_ps = capture.pulse_fwhm_ps or 0.0
     place, photons = np.full(len(pixel), np.nan), np.zeros(len(pixel))
-    for begin, end in _chunks(last - first):
+    for begin, end in chunks(np.append(0, np.cumsum(last - first))):
         lengths = np.maximum(last - first, 0)[begin:end]
         # the counts in the gates of all rays, concatenated, and the first of each ray
         offset = np.concatenate([[0], np.cumsum(lengths)])
@@ -205,16 +202,6 @@ def measured(
             matched,
         )
     return capture.start_m[pixel] + (first + place) * capture.bin_m, photons
-
-
-def _chunks(lengths: np.ndarray) -> Iterator[tuple[int, int]]:
-    """Slices of rays with at most `CHUNK_BINS` bins together, as begin and end."""
-    ends = np.append(0, np.cumsum(lengths))
-    begin = 0
-    while begin < len(lengths):
-        end = max(int(np.searchsorted(ends[1:], ends[begin] + CHUNK_BINS, side="right")), begin + 1)
-        yield begin, end
-        begin = end
 
 
 def _measured(

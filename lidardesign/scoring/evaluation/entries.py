@@ -278,8 +278,14 @@ def strongest_baseline(request: EvaluationRequest, entries: Sequence[Entry], ray
     held_back = request.train if request.training is None else request.training.scenes(HELD_BACK)
     count = min(max(affordable, FEWEST_BASELINE_SCENES), MOST_BASELINE_SCENES)
     scenes = list(itertools.islice(held_back, count))
-    scene_pass = request.scene_pass(lambda number: [entry.lit_in(number) for entry in baselines], request.planner)
-    found = score_scenes(replace(scene_pass, scenes=scenes))
+    found = score_scenes(
+        request.task,
+        request.metric,
+        request.seed,
+        scenes,
+        lambda number: [entry.lit_in(number) for entry in baselines],
+        request.planner,
+    )
     means = np.mean([[score.value for score, _ in scene.scores] for scene in found], axis=0).tolist()
     values = dict(zip((entry.name for entry in baselines), means, strict=True))
     return StrongestBaseline.best_of(values, request.metric.better, rays, len(scenes))

@@ -22,12 +22,11 @@ from lidardesign.scenes.scene import Scene
 from lidardesign.scoring.baselines.cma import CmaSettings
 from lidardesign.scoring.baselines.simple import ALWAYS, BASELINES, check_baseline
 from lidardesign.scoring.evaluation.mounting import MountError
-from lidardesign.scoring.scene_scores import RaysPerCondition, ScenePass
-from lidardesign.sensors.adaptive import AdaptivePatterns, AdaptiveRays
+from lidardesign.sensors.adaptive import AdaptivePatterns, AdaptiveRays, mapped
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.simulate.calibration import with_part_light
-from lidardesign.simulate.plan import EffectPlan, Planner
+from lidardesign.simulate.plan import Planner
 from lidardesign.space import DesignSpace
 from lidardesign.task import Metric, Task, metric_of, mount_of
 from lidardesign.workers import Starmap
@@ -136,13 +135,7 @@ class EvaluationRequest:
     def following(self, design: DesignSpec, adaptive: AdaptivePatterns) -> AdaptiveRays:
         """The rays of a design's patterns that follow what they see, with the detector's light."""
         rays = adaptive.rays(features_of(self.task))
-        return rays.mapped(lambda one: with_part_light(one, design, self.planner.detector))
-
-    def scene_pass(
-        self, fired: Callable[[int], Sequence[RaysPerCondition]], planner: Planner, plans: Sequence[EffectPlan] = ()
-    ) -> ScenePass:
-        """Sets of rays in the held-out scenes: see `ScenePass`."""
-        return ScenePass(self.task, self.metric, self.seed, self.test, fired, planner, plans)
+        return mapped(rays, lambda one: with_part_light(one, design, self.planner.detector))
 
 
 def numbers_fired(design: DesignSpec, asked: Iterable[int], alone: Sequence[int] = ()) -> list[int]:

@@ -222,14 +222,9 @@ class Evaluation:
     named: Sequence[str] = ()
 
     @property
-    def middle_rays(self) -> int:
-        """The number of rays of headline figures, see `middle_rays`."""
-        return middle_rays(self.rows)
-
-    @property
     def headline_rows(self) -> dict[str, Row]:
         """Every design's row by its name: at the middle number of rays, or the closest that it has."""
-        rows, count = [row for row in self.rows if not row.baseline], self.middle_rays
+        rows, count = [row for row in self.rows if not row.baseline], middle_rays(self.rows)
         closest = {row.design: row for row in sorted(rows, key=lambda row: -abs(row.rays - count))}
         return {name: closest[name] for name in dict.fromkeys(row.design for row in rows)}
 
@@ -244,7 +239,7 @@ class Evaluation:
     def best_row(self) -> Row:
         """The best of the rows in `headline_rows`: at the middle number of rays, where any design has that."""
         rows = list(self.headline_rows.values())
-        usual = [row for row in rows if row.rays == self.middle_rays] or rows
+        usual = [row for row in rows if row.rays == middle_rays(self.rows)] or rows
         return (min if self.metric.better == "lower" else max)(usual, key=lambda row: row.value)
 
     @property

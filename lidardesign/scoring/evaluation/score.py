@@ -125,8 +125,7 @@ def _audit(
     progress: Progress | None,
 ) -> Audit:
     """The audit: the same entries under all effects, with the same random numbers."""
-    planner = replace(request.planner, choice="all")
-    scored = _score_all(request, entries, planner, progress, [planner.chosen_from(plan) for plan in plans])
+    scored = _score_all(request, entries, replace(request.planner, choice="all"), progress)
     paired = list(zip(effect_summaries(plans), effect_summaries(scored.plans), strict=True))
     metric = request.metric
     return Audit(
@@ -192,8 +191,17 @@ def _score_all(
 ) -> _Scored:
     """Score all entries in all scenes, here or by workers; `known` plans are not made again."""
     jobs = {entry.key: entry for entry in entries}
-    scene_pass = request.scene_pass(lambda number: [entry.lit_in(number) for entry in jobs.values()], planner, known)
-    scenes = score_scenes(scene_pass, progress, request.starmap)
+    scenes = score_scenes(
+        request.task,
+        request.metric,
+        request.seed,
+        request.test,
+        lambda number: [entry.lit_in(number) for entry in jobs.values()],
+        planner,
+        known,
+        progress,
+        request.starmap,
+    )
     of_entries = zip(*(scene.scores for scene in scenes), strict=True)
     return _Scored(
         dict(zip(jobs, of_entries, strict=True)),

@@ -175,10 +175,8 @@ def _checked(value: Any, where: str, key: str, quantity: Quantity, scale: float)
     kind = "a whole number" if quantity.whole else "a number"
     allowed = f"{kind}{' above' if quantity.above else ' from'} {low:g}"
     allowed += "" if math.isinf(high) else f"{' up' if quantity.above else ''} to {high:g}"
-    right = isinstance(value, int | float) and not isinstance(value, bool)
-    if not right or not math.isfinite(value) or (quantity.whole and value != int(value)):
-        raise ConfigError(f"{key}: found {value!r}", where=where, allowed=allowed)
-    number = float(value) * scale
+    right = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    number = float(value) * scale if right and not (quantity.whole and value != int(value)) else math.nan
     inside = quantity.low < number if quantity.above else quantity.low <= number
     if not inside or number > quantity.high or not math.isfinite(number):
         raise ConfigError(f"{key}: found {value!r}", where=where, allowed=allowed)

@@ -211,14 +211,15 @@ class Bins:
         offset = self.offset[begin : end + 1] - self.offset[begin]
         return Bins(self.windows_m[begin:end], self.first_m[begin:end], self.width_m, offset)
 
-    def chunks(self) -> Iterator[tuple[int, int]]:
-        """Begin and end of chunks of rays whose bins fit into memory."""
-        begin = 0
-        while begin < len(self):
-            end = int(np.searchsorted(self.offset, self.offset[begin] + BINS_AT_ONCE, side="right")) - 1
-            end = min(max(end, begin + 1), begin + RAYS_AT_ONCE)
-            yield begin, end
-            begin = end
+
+def chunks(offset: np.ndarray) -> Iterator[tuple[int, int]]:
+    """Begin and end of chunks of rays whose bins, offset[i] to offset[i + 1], fit into memory."""
+    begin = 0
+    while begin < len(offset) - 1:
+        end = int(np.searchsorted(offset, offset[begin] + BINS_AT_ONCE, side="right")) - 1
+        end = min(max(end, begin + 1), begin + RAYS_AT_ONCE)
+        yield begin, end
+        begin = end
 
 
 def bins_of(windows_m: np.ndarray, echoes: Echoes, detector: Detector, quantised: bool) -> Bins:

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -75,7 +75,7 @@ def through_air(
     ends = np.full(len(rays), -np.inf)
     np.maximum.at(ends, beams.ray, stops_m)
     edges_m = _cells(windows_m[:, 0], np.clip(ends, windows_m[:, 0], windows_m[:, 1]), photons.aperture_m2)
-    gain = _Haze(rays, scene.receiver, medium, photons, ends).gain(edges_m) * _lit_shares(beams, stops_m, edges_m)
+    gain = _haze_gain(rays, scene.receiver, medium, photons, ends, edges_m) * _lit_shares(beams, stops_m, edges_m)
     emitted = photons.emitted(detector.sharing(rays)) * detector.light_of(rays)
     counts = emitted[:, None] * photons.efficiency * gain
     return faded, replace(background, edges_m=edges_m, counts=counts)
@@ -114,50 +114,43 @@ def _cells(starts: np.ndarray, ends: np.ndarray, aperture_m2: float) -> np.ndarr
     return np.maximum.accumulate(np.clip(edges, starts[:, None], ends[:, None]), axis=1)
 
 
-@dataclass(frozen=True, eq=False)
-class _Haze:
-    """Backscatter of haze along rays.
+def _haze_gain(
+    rays: Rays, receiver: Receiver | None, medium: Medium, photons: Photons, focus_m: np.ndarray, edges_m: np.ndarray
+) -> np.ndarray:
+    """Share of each ray's light that haze in cells of half paths (N, C + 1) scatters into its pixel, (N, C).
 
     Arguments:
         rays, receiver, medium, photons: Rays, receiver, medium, and the detector's aperture and pixel.
         focus_m: Focus distance of each ray's pixel, shape (N,) [m].
+        edges_m: Edges of the cells [m].
     """
-
-    rays: Rays
-    receiver: Receiver | None
-    medium: Medium
-    photons: Photons
-    focus_m: np.ndarray
-
-    def gain(self, edges_m: np.ndarray) -> np.ndarray:
-        """Share of each ray's light that haze in cells of half paths (N, C + 1) scatters into its pixel, (N, C)."""
-        nodes, weights = np.polynomial.legendre.leggauss(NODES)
-        ranges = np.stack([range_of_path(self.rays, self.receiver, column) for column in edges_m.T], axis=1)
-        # paths shorter than the way from emitter to receiver come from no range
-        ranges = np.nan_to_num(ranges, nan=0.0)
-        middle, half = (ranges[:, 1:] + ranges[:, :-1]) / 2, (ranges[:, 1:] - ranges[:, :-1]) / 2
-        gain = np.zeros_like(middle)
-        for node, weight in zip(nodes, weights, strict=True):
-            # Share of the light that haze at ranges (N, C) scatters into the aperture and the pixel per metre [1/m]
-            range_m = middle + node * half
-            # Share of the light in the aperture that falls on the ray's pixel, (N, C)
-            blurred = 1 - safe_divide(range_m, np.broadcast_to(self.focus_m[:, None], range_m.shape), 1.0)
-            sharp = self.photons.field_of_view_sr * range_m**2
-            overlap = np.minimum(safe_divide(sharp, self.photons.aperture_m2 * blurred**2, 1.0), 1.0)
-            back_m, seen = range_m, 1.0
-            if self.receiver is not None:
-                place = np.asarray(self.receiver.origin_m)
-                points = self.rays.origin_m[:, None] + range_m[..., None] * self.rays.direction[:, None]
-                back_m, seen = np.linalg.norm(points - place, axis=-1), in_view(self.receiver, points)
-                overlap = np.where((self.rays.origin_m == place).all(axis=1)[:, None], overlap, 1.0)
-            faded = np.exp(-self.medium.extinction_per_m * (range_m + back_m))
-            # The solid angle of a disc seen from its axis: area / distance^2 from afar, half of all around on it
-            squared = self.photons.aperture_m2 / math.pi
-            slant = np.sqrt(back_m**2 + squared)
-            # 2 pi (1 - d / slant) without its cancellation from afar
-            caught_sr = (2 * math.pi * squared / (slant * (slant + back_m))) * overlap
-            gain += weight * half * (self.medium.backscatter_per_m_sr * caught_sr * faded * seen)
-        return gain
+    nodes, weights = np.polynomial.legendre.leggauss(NODES)
+    ranges = np.stack([range_of_path(rays, receiver, column) for column in edges_m.T], axis=1)
+    # paths shorter than the way from emitter to receiver come from no range
+    ranges = np.nan_to_num(ranges, nan=0.0)
+    middle, half = (ranges[:, 1:] + ranges[:, :-1]) / 2, (ranges[:, 1:] - ranges[:, :-1]) / 2
+    gain = np.zeros_like(middle)
+    for node, weight in zip(nodes, weights, strict=True):
+        # Share of the light that haze at ranges (N, C) scatters into the aperture and the pixel per metre [1/m]
+        range_m = middle + node * half
+        # Share of the light in the aperture that falls on the ray's pixel, (N, C)
+        blurred = 1 - safe_divide(range_m, np.broadcast_to(focus_m[:, None], range_m.shape), 1.0)
+        sharp = photons.field_of_view_sr * range_m**2
+        overlap = np.minimum(safe_divide(sharp, photons.aperture_m2 * blurred**2, 1.0), 1.0)
+        back_m, seen = range_m, 1.0
+        if receiver is not None:
+            place = np.asarray(receiver.origin_m)
+            points = rays.origin_m[:, None] + range_m[..., None] * rays.direction[:, None]
+            back_m, seen = np.linalg.norm(points - place, axis=-1), in_view(receiver, points)
+            overlap = np.where((rays.origin_m == place).all(axis=1)[:, None], overlap, 1.0)
+        faded = np.exp(-medium.extinction_per_m * (range_m + back_m))
+        # The solid angle of a disc seen from its axis: area / distance^2 from afar, half of all around on it
+        squared = photons.aperture_m2 / math.pi
+        slant = np.sqrt(back_m**2 + squared)
+        # 2 pi (1 - d / slant) without its cancellation from afar
+        caught_sr = (2 * math.pi * squared / (slant * (slant + back_m))) * overlap
+        gain += weight * half * (medium.backscatter_per_m_sr * caught_sr * faded * seen)
+    return gain
 
 
 def why_absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:

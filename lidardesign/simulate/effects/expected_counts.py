@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import scipy
 
 from lidardesign.numerics import COARSE_SLACK, EPSILON, SQUARABLE, TINY, safe_divide
 from lidardesign.scenes.rays import range_of_path
@@ -146,11 +147,6 @@ class Counts:
         return detector.photons.emitted(self.first_hits.sharing) * detector.light_of(self.first_hits.rays)
 
     @cached_property
-    def signal_per_pulse(self) -> np.ndarray:
-        """Counts of a return per pulse in clear air, 0 without one, shape (N,)."""
-        return np.where(self.first_hits.returned, self._of_first_hit, 0.0)
-
-    @cached_property
     def _of_first_hit(self) -> np.ndarray:
         photons = self.first_hits.detector.photons
         per_gain = self._emitted * photons.aperture_m2 * photons.efficiency
@@ -162,9 +158,7 @@ class Counts:
 
         At most the part of a Gaussian beyond the nearer end of the window, which is `nearer_m` nearer [m].
         """
-        from scipy.special import ndtr
-
-        share = ndtr((nearer_m - self.first_hits.gate_edge_m) / np.maximum(sigma_m, SQUARABLE))
+        share = scipy.special.ndtr((nearer_m - self.first_hits.gate_edge_m) / np.maximum(sigma_m, SQUARABLE))
         return np.where(self.first_hits.returned, 0.0, self._of_first_hit * self.pulses * share)
 
     def spilled(self, moved_m: np.ndarray) -> np.ndarray:
@@ -177,7 +171,7 @@ class Counts:
     @cached_property
     def signal(self) -> np.ndarray:
         """Counts of a return per frame in clear air, 0 without one, shape (N,)."""
-        return self.signal_per_pulse * self.pulses
+        return np.where(self.first_hits.returned, self._of_first_hit, 0.0) * self.pulses
 
     @property
     def typical(self) -> str:
@@ -239,10 +233,8 @@ class Counts:
 
     def share_in_bins(self, count: int, sigma_m: np.ndarray) -> np.ndarray:
         """Share of an echo's photons in an odd number of bins, at most the share inside its gate, shape (N,)."""
-        from scipy.special import ndtr
-
         away = (self.first_hits.window_m - self.first_hits.path_m[:, None]).T / np.maximum(sigma_m, SQUARABLE)
-        inside = np.where(self.first_hits.returned, ndtr(away[1]) - ndtr(away[0]), 1.0)
+        inside = np.where(self.first_hits.returned, scipy.special.ndtr(away[1]) - scipy.special.ndtr(away[0]), 1.0)
         return np.minimum(share_in_bins(count, self.bin_m, sigma_m), inside)
 
     def missed(self, signal: np.ndarray, per_bin: np.ndarray | float, sigma_m: np.ndarray) -> np.ndarray:
@@ -253,11 +245,9 @@ class Counts:
             per_bin: Background counts in each bin, shape (N,).
             sigma_m: Standard deviation of one photon's half path, shape (N,) [m].
         """
-        from scipy.special import pdtr
-
         per_bin = np.broadcast_to(per_bin, signal.shape)
         expected = signal * self.share_in_bins(self.pulse_bins, sigma_m) + per_bin * self.pulse_bins
-        return pdtr(self.needed(per_bin) - 1, expected)
+        return scipy.special.pdtr(self.needed(per_bin) - 1, expected)
 
     def more_missed(self, before: Echo, after: Echo) -> np.ndarray:
         """Increase of the probability that an echo is missed, with or without ambient light, the larger, (N,)."""
@@ -282,9 +272,7 @@ class Counts:
 
     def missed_on_edges(self, signal: np.ndarray, sigma_m: np.ndarray) -> np.ndarray:
         """Increase of the probability that an echo is missed on the edge of a bin over its middle, shape (N,)."""
-        from scipy.special import erf
-
-        middle = erf(self.pulse_bins * self.bin_m / (2 * math.sqrt(2) * np.maximum(sigma_m, SQUARABLE)))
+        middle = scipy.special.erf(self.pulse_bins * self.bin_m / (2 * math.sqrt(2) * np.maximum(sigma_m, SQUARABLE)))
         share = safe_divide(middle, self.share_in_bins(self.pulse_bins, sigma_m), 1.0)
         return self.more_missed(Echo(signal * share, sigma_m), Echo(signal, sigma_m))
 
@@ -331,10 +319,10 @@ def count_text(number: float) -> str:
 
 def share_in_bins(count: int, bin_m: float, sigma_m: np.ndarray) -> np.ndarray:
     """Share of an echo's photons in an odd number of bins in the worst case, on an edge of the middle one, (N,)."""
-    from scipy.special import erf
-
     spread_m = math.sqrt(2) * np.maximum(sigma_m, SQUARABLE)
-    return 0.5 * (erf((count - 1) / 2 * bin_m / spread_m) + erf((count + 1) / 2 * bin_m / spread_m))
+    return 0.5 * (
+        scipy.special.erf((count - 1) / 2 * bin_m / spread_m) + scipy.special.erf((count + 1) / 2 * bin_m / spread_m)
+    )
 
 
 def needed_counts(per_bin: np.ndarray, bins: np.ndarray, false_alarm: float) -> np.ndarray:
@@ -342,15 +330,13 @@ def needed_counts(per_bin: np.ndarray, bins: np.ndarray, false_alarm: float) -> 
 
     The union over bins: B P(X >= k) <= false_alarm.
     """
-    from scipy.special import pdtr, pdtrik
-
     allowed = np.clip(false_alarm / bins, EPSILON, 1.0)
     least = np.maximum(per_bin, TINY)
     quiet = -np.expm1(-least) <= allowed
     with np.errstate(invalid="ignore"):
-        needed = np.ceil(np.nan_to_num(pdtrik(1 - allowed, least))) + 1
+        needed = np.ceil(np.nan_to_num(scipy.special.pdtrik(1 - allowed, least))) + 1
     # the inverse is of a smooth curve through the steps: one step more where it falls short
-    needed += 1 - pdtr(needed - 1, least) > allowed
+    needed += 1 - scipy.special.pdtr(needed - 1, least) > allowed
     return np.where(quiet, 1.0, np.maximum(needed, 1.0))
 
 
@@ -404,11 +390,9 @@ class Blindness:
 
 def missed_behind(counts: Counts, blind: Blindness, sigma_m: np.ndarray) -> np.ndarray:
     """Probability that the counted echo is below the threshold of its gate's mean background, shape (N,)."""
-    from scipy.special import pdtr
-
     width = counts.pulse_bins
     expected = blind.left * counts.share_in_bins(width, sigma_m) + width * counts.per_bin * blind.under
-    return pdtr(counts.needed(counts.per_bin * blind.level) - 1, expected)
+    return scipy.special.pdtr(counts.needed(counts.per_bin * blind.level) - 1, expected)
 
 
 def unevenness(counts: Counts, blind: Blindness) -> np.ndarray:
@@ -416,11 +400,11 @@ def unevenness(counts: Counts, blind: Blindness) -> np.ndarray:
 
     The union over all bins at the start's level, less that at the mean level.
     """
-    from scipy.special import pdtrc
-
     needed = counts.needed(counts.per_bin * blind.level)
     mean, start = (counts.pulse_bins * counts.per_bin * share for share in (blind.level, blind.awake))
-    return np.clip(counts.bins * (pdtrc(needed - 1, start) - pdtrc(needed - 1, mean)), 0.0, 1.0)
+    return np.clip(
+        counts.bins * (scipy.special.pdtrc(needed - 1, start) - scipy.special.pdtrc(needed - 1, mean)), 0.0, 1.0
+    )
 
 
 def variance_of_missing(counts: Counts, before: np.ndarray, left: np.ndarray, sigma_m: np.ndarray) -> np.ndarray:

@@ -64,7 +64,10 @@ def split_beams(beams: Beams, detector: Detector) -> Beams:
     # disc, the sine is sqrt(s u (2 - s u)), and the point of the disc has the length sqrt(s)
     full = 2 * math.sin(detector.divergence_rad / 4) ** 2
     aside = disc * np.sqrt(full * (2 - share * full))[:, None]
-    lateral, upright = _across(beams.direction)
+    # perpendicular unit vectors, horizontally to the left and upwards; of azimuth 0 at a pole
+    azimuth = np.arctan2(beams.direction[:, 1], beams.direction[:, 0])
+    lateral = np.stack([-np.sin(azimuth), np.cos(azimuth), np.zeros(len(azimuth))], axis=1)
+    upright = np.cross(beams.direction, lateral)
     direction = (1 - share * full)[:, None] * beams.direction[:, None]
     direction = direction + aside[:, :1] * lateral[:, None] + aside[:, 1:] * upright[:, None]
     return Beams(
@@ -74,13 +77,6 @@ def split_beams(beams: Beams, detector: Detector) -> Beams:
         np.repeat(beams.time_s, count),
         np.repeat(beams.share / count, count),
     )
-
-
-def _across(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Unit vectors perpendicular to directions (B, 3), horizontally to the left and upwards; of azimuth 0 at a pole."""
-    azimuth = np.arctan2(direction[:, 1], direction[:, 0])
-    lateral = np.stack([-np.sin(azimuth), np.cos(azimuth), np.zeros(len(azimuth))], axis=1)
-    return lateral, np.cross(direction, lateral)
 
 
 # Smallest share of a range that counts as an edge: ranges of meshes are exact only to float32.

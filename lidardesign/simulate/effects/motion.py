@@ -32,8 +32,8 @@ from lidardesign.simulate.detector.physics import IDEAL, Detector
 from lidardesign.simulate.effects.expected_counts import Counts
 from lidardesign.simulate.effects.first_hits import EffectBound, FirstHits, edge_probability
 
-# Rays (N, 3), (N, 3) in a body's own frame and limits (N,) to ranges (N,), infinite on a miss, and normals (N, 3).
-LocalTracer = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+# First hits of rays (N, 3), (N, 3) in a body's own frame before limits (N,).
+LocalTracer = Callable[[np.ndarray, np.ndarray, np.ndarray], Hits]
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,11 +121,11 @@ class _MovingBody:
             rotation, translation = path.at(elapsed_s[near])
             local_origins = np.einsum("nji,nj->ni", rotation, origins[rows] - translation)
             local_directions = np.einsum("nji,nj->ni", rotation, directions[rows])
-            range_m, normal = self._trace(local_origins, local_directions, hits.range_m[rows])
-            hit = np.flatnonzero(np.isfinite(range_m))
-            won, turned = rows[hit], np.einsum("nij,nj->ni", rotation[hit], normal[hit])
+            found = self._trace(local_origins, local_directions, hits.range_m[rows])
+            hit = np.flatnonzero(np.isfinite(found.range_m))
+            won, turned = rows[hit], np.einsum("nij,nj->ni", rotation[hit], found.normal[hit])
             turned[np.einsum("nk,nk->n", turned, directions[won]) > 0] *= -1
-            hits.range_m[won], hits.body[won], hits.normal[won] = range_m[hit], self._index, turned
+            hits.range_m[won], hits.body[won], hits.normal[won] = found.range_m[hit], self._index, turned
 
     def _pieces(self, time_s: np.ndarray) -> Iterator[tuple[Screw, np.ndarray, np.ndarray]]:
         """Screws of the body's path, each with the rows of its rays and their times since its start [s]."""
@@ -161,13 +161,13 @@ def _local_tracer(shape: Shape) -> tuple[LocalTracer, np.ndarray, float]:
     """Tracer of a shape in its own frame, and the centre (3,) and radius of a ball around it [m]."""
     if isinstance(shape, Mesh):
         caster, counted = mesh_caster(shape), SecondCasts()
-        return partial(caster.first_hits, twice=counted), caster.centre_m, caster.radius_m
+        return partial(caster.trace, twice=counted), caster.centre_m, caster.radius_m
     group = Primitives([(0, Body(shape))], 0)
 
-    def trace(origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def trace(origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> Hits:
         hits = Hits.none(len(origins))
         group.keep_nearer(hits, origins, directions, limit_m)
-        return hits.range_m, hits.normal
+        return hits
 
     return trace, np.zeros(3), group.radius_m
 

@@ -50,7 +50,7 @@ import numpy as np
 from lidardesign.numerics import EPSILON_FLOAT32, safe_divide
 from lidardesign.scenes.casting import shared_caster
 from lidardesign.scenes.rays import Hits, Rays, in_view, path_windows
-from lidardesign.scenes.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Scene, Sphere
+from lidardesign.scenes.scene import Scene
 from lidardesign.simulate.detector.light import Beams, Echoes, direct_echoes, reflectances
 from lidardesign.simulate.detector.physics import Detector, Physics, resolution_m
 from lidardesign.simulate.effects.expected_counts import Counts
@@ -259,8 +259,6 @@ TINY_PERCENT = 0.01
 
 def why_absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:
     """Reason why multipath light changes nothing, or None."""
-    if len(scene.bodies) == 1 and _convex_from(scene.bodies[0], lists):
-        return "one convex body lights nothing else"
     if not detector.bin_s and not detector.pulse_sigma_s:
         return "later light is separate from the first echo"
     return None if any(body.reflectance > 0 for body in scene.bodies) else "nothing reflects"
@@ -315,27 +313,3 @@ def _detours(first_hits: FirstHits, rows: np.ndarray) -> Detours:
     # a flood's pixels see spots lit by its emitters; a fixed receiver gets light from anywhere in its view
     lamp_m = None if flood or receiver is None else np.asarray(receiver.origin_m)
     return lamp_bound(first_hits.scene, rays, hits, first_hits.caster, lamp_m, first_hits.resolution_m)
-
-
-def _convex_from(body: Body, lists: Sequence[Rays]) -> bool:
-    if isinstance(body.shape, Mesh):
-        return False
-    poses = body.poses if body.poses.ndim == 3 else body.poses[None]
-    return not any(_inside(body, rays.origin_m, pose).any() for rays in lists for pose in poses)
-
-
-def _inside(body: Body, points: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Mask of points (N, 3) inside a primitive, shape (N,); a plane has no inside."""
-    shape, local = body.shape, (points - pose[:3, 3]) @ pose[:3, :3]
-    if isinstance(shape, Box):
-        return (np.abs(local) < np.asarray(shape.half_extents_m)).all(axis=1)
-    if isinstance(shape, Capsule):
-        local[:, 2] -= np.clip(local[:, 2], -shape.half_length_m, shape.half_length_m)
-    if isinstance(shape, Plane):
-        return np.zeros(len(points), dtype=bool)
-    if isinstance(shape, Cylinder):
-        return (np.hypot(local[:, 0], local[:, 1]) < shape.radius_m) & (np.abs(local[:, 2]) < shape.half_length_m)
-    if isinstance(shape, Ellipsoid):
-        return np.linalg.norm(local / shape.semi_axes_m, axis=1) < 1
-    assert isinstance(shape, Sphere | Capsule)
-    return np.linalg.norm(local, axis=1) < shape.radius_m

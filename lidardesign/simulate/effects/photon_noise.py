@@ -54,17 +54,14 @@ def why_absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str |
 
 def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
     """Bound of the effect of photon noise."""
+    from scipy.special import ndtr
+
     sigma_m, blind = first_hits.sigma_m(), Blindness.of(counts)
     missed = missed_behind(counts, blind, sigma_m)
     invented = -np.expm1(-counts.leaked(sigma_m))
     reason = f"a return has about {counts.typical} photons"
-    squared = counts.error_m(blind.left, sigma_m) ** 2 + _cut_m(first_hits, sigma_m) ** 2
-    return EffectBound(squared, np.where(first_hits.returned, missed, invented), reason)
-
-
-def _cut_m(first_hits: FirstHits, sigma_m: np.ndarray) -> np.ndarray:
-    """Shift of a pulse's mean by truncation at the gate's end, shape (N,) [m]."""
-    from scipy.special import ndtr
-
+    # the mean of a pulse is shifted by its truncation at the gate's end
     away = np.where(first_hits.returned, first_hits.gate_edge_m, np.inf) / np.maximum(sigma_m, SQUARABLE)
-    return sigma_m * np.exp(-(away**2) / 2) / (math.sqrt(2 * math.pi) * ndtr(away))
+    cut_m = sigma_m * np.exp(-(away**2) / 2) / (math.sqrt(2 * math.pi) * ndtr(away))
+    squared = counts.error_m(blind.left, sigma_m) ** 2 + cut_m**2
+    return EffectBound(squared, np.where(first_hits.returned, missed, invented), reason)

@@ -75,18 +75,12 @@ def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
     missed = np.maximum(np.maximum(in_light, in_the_dark), 0.0)
     any_count = -np.expm1(-counts.bins * per_bin - haze[0])
     mistaken = counts.mistaken(blind.left, per_bin + haze[1], per_bin * blind.under, sigma_m)
-    lost = np.where(
-        first_hits.returned,
-        np.minimum(missed + np.clip(gone, 0.0, 1.0) * np.minimum(mistaken, any_count), 1.0),
-        _invented(counts, blind),
-    )
+    lost = np.minimum(missed + np.clip(gone, 0.0, 1.0) * np.minimum(mistaken, any_count), 1.0)
+    # where there is no return, background is taken for one
+    stray = haze[0] + counts.leaked(sigma_m)
+    fewer = (per_bin * counts.bins + stray) * (1 - blind.level)
+    invented = np.minimum(unevenness(counts, blind) - np.expm1(-stray), np.minimum(fewer, 1.0))
     typical = float(np.median(blind.per_pulse[first_hits.returned] if first_hits.returned.any() else blind.per_pulse))
     dead_ns = 1e9 * first_hits.detector.photons.dead_s
+    lost = np.where(first_hits.returned, lost, invented)
     return EffectBound(squared, lost, f"{count_text(typical)} counts per pulse, {dead_ns:.3g} ns blind after each")
-
-
-def _invented(counts: Counts, blind: Blindness) -> np.ndarray:
-    """Bound of the change of the probability that background is taken for a return, shape (N,)."""
-    stray = counts.pulses * counts.haze_per_pulse[0] + counts.leaked(counts.first_hits.sigma_m())
-    gone = (counts.per_bin * counts.bins + stray) * (1 - blind.level)
-    return np.minimum(unevenness(counts, blind) - np.expm1(-stray), np.minimum(gone, 1.0))

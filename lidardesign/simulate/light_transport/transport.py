@@ -40,14 +40,12 @@ from lidardesign.run.child import Child, ChildError
 from lidardesign.scenes.casting import shared_caster
 from lidardesign.scenes.rays import Hits, Rays, receiver_axes
 from lidardesign.scenes.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Plane, Receiver, Scene, Sphere
-from lidardesign.scenes.surface import round_triangles
+from lidardesign.scenes.surface import BOX_CORNERS, BOX_QUADS, round_triangles
 
 # Half sizes of a plane's nested squares, in reaches. Parts further out send back less than 1e-4 of its light.
 PLANE_REACHES = (2.0, 10.0, 100.0)
 ROUND_STEPS = 360  # round cylinders and ellipsoids, which the renderer takes as meshes: flat sides half a degree off
 _SQUARE = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=float)
-_CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
-_BOX_QUADS = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
 
 
 def scene_shapes(
@@ -84,7 +82,7 @@ def _shape(
         vertices, faces = _plane(max(reach_m, float(np.linalg.norm(nearest))))
         return {"kind": "mesh"}, {"vertices": vertices @ rotation.T + nearest, "faces": faces}
     if isinstance(shape, Box):
-        vertices, faces = _CORNERS * np.array(shape.half_extents_m), _split(_BOX_QUADS)
+        vertices, faces = BOX_CORNERS * np.array(shape.half_extents_m), _split(BOX_QUADS)
     elif isinstance(shape, Cylinder | Ellipsoid):
         vertices, faces = round_triangles(shape, ROUND_STEPS)
     else:
@@ -142,9 +140,6 @@ class Lights:
     lambertian: np.ndarray
     radius_m: np.ndarray
     lead_m: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.origin_m)
 
     @classmethod
     def beams(
@@ -281,17 +276,13 @@ def render_transient(
     request |= {"bounces": bounces, "own": own_light}
     arrays |= (light_columns := _light_columns(lights, centre_m, reach_m))
     by_ray = columns | (light_columns if own_light else {})
+    # the answers of all requests, without the padding rays of the last
     parts = []
     for number, rows in enumerate(_chunks(count, bins.count)):
         mine = arrays | {name: values[rows] for name, values in by_ray.items()}
         own_seed = int(np.random.SeedSequence([seed, number]).generate_state(1)[0])
-        parts.append((rows[0], ask({**request, "seed": own_seed}, mine)))
-    return _joined(bins, count, parts)
-
-
-def _joined(bins: PathBins, count: int, answers: list[tuple[int, dict[str, np.ndarray]]]) -> Transients:
-    """Join the answers of all requests, by the first ray of each, without the padding rays of the last."""
-    parts = [{**found, "ray": found["ray"] + start} for start, found in answers]
+        found = ask({**request, "seed": own_seed}, mine)
+        parts.append({**found, "ray": found["ray"] + rows[0]})
     ray, cell, radiance, steady = (
         np.concatenate([part[name] for part in parts]) for name in ("ray", "cell", "radiance", "steady")
     )

@@ -1,0 +1,147 @@
+"""Kills of learn, fit and evaluate, `make soak-kills`: what is left can be read, and going on gives the same bytes.
+
+A fork is sent SIGKILL or SIGTERM before one of the steps by which files change, or after a random time. Then every
+file that is there must be readable, the command given again (`learn` with --resume) must end well and leave no lock and
+no temporary file, and the bytes of flow, samples, snapshots, checkpoint, designs and tables must be those of a run that
+nobody disturbed, but for the seconds in them. Of two commands at once in one folder one must work, and the other must
+work or be told why not.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import shutil
+import signal
+import time
+import zlib
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.soak.disturbed import COMMANDS, FINISHED, LEARN, Ended, Fork, Straight, contents, strays, unreadable
+from benchmarks.soak.long_runs import amount
+
+# Commands that are given at once, in a folder as it was before one of them.
+GIVEN = {**{name: command.arguments for name, command in COMMANDS.items()}, "learn --resume": [*LEARN, "--resume"]}
+PAIRS = {
+    f"{first} and {second}": (before, first, second)
+    for before, first, second in (
+        ("learn", "learn", "learn"), ("learn", "learn", "learn --resume"), ("learn", "learn", "fit"),
+        ("fit", "learn --resume", "learn --resume"), ("fit", "learn --resume", "fit"), ("fit", "fit", "fit"),
+        ("evaluate", "evaluate", "evaluate"), ("evaluate", "evaluate", "fit"),
+    )
+}  # fmt: skip
+REFUSED = (2, 3)
+LONGEST_DELAY_S = 2.0
+TERMINATED = 143
+# How often a command is ended in a round, by where; one of many steps more often than one of few.
+TURNS = {"step": {"learn": 10, "learn --tolerance": 6, "fit": 2, "evaluate": 1}, "time": dict.fromkeys(COMMANDS, 1)}
+WAYS = [(where, sent) for where in TURNS for sent in ("SIGKILL", "SIGTERM")]
+ROUND = [
+    *((*way, name) for turn in range(10) for way in WAYS for name, turns in TURNS[way[0]].items() if turn < turns),
+    *(("pair", "", name) for name in PAIRS),
+]
+
+
+def pytest_generate_tests(metafunc):
+    done = Counter()
+    rows = []
+    for case in itertools.islice(itertools.cycle(ROUND), amount(metafunc.config)):
+        rows.append((*case, done[case]))
+        done[case] += 1
+    metafunc.parametrize(("where", "sent", "name", "number"), rows)
+
+
+@pytest.fixture(scope="session")
+def straight(tmp_path_factory):
+    """A function that gives the run that nobody disturbed: not needed where all is done."""
+    return functools.cache(lambda: Straight(tmp_path_factory.mktemp("straight")))
+
+
+@pytest.mark.long
+@pytest.mark.filterwarnings("default")
+def test_what_is_disturbed_recovers(tmp_path, piece, straight, where, sent, name, number):
+    def work():
+        if where == "pair":
+            met, told, faults = at_once(straight(), name, number, tmp_path / "both")
+        else:
+            met, told, faults = ended_early(straight(), where, sent, name, number, tmp_path / "killed")
+        faults = [f"{name}, {told}: {fault}" for fault in faults]
+        case = f"{name}, {sent} at a {where}" if sent else name
+        return {"case": case, "counts": {"met at work, or both worked": int(met)}, "faults": faults}
+
+    piece(work)
+
+
+def ended_early(
+    straight: Straight, where: str, sent: str, name: str, number: int, place: Path
+) -> tuple[bool, str, list[str]]:
+    """End one command in a folder of its own, look, give it again, and compare.
+
+    Returns:
+        Whether it was met at work, at which moment, and what was not as it must be.
+    """
+    whole, sign = straight.ends[name], signal.Signals[sent]
+    straight.before(name, place)
+    if where == "step":  # every one of them, in as many rounds
+        step = int(np.random.default_rng(0).permutation(whole.steps)[number % whole.steps]) + 1
+        told, ended = f"step {step}", Fork(GIVEN[name], place, step, sign).ended()
+    else:
+        after_s = np.random.default_rng([zlib.crc32(f"{sent} {name}".encode()), number]).uniform(0, whole.seconds)
+        told, ended = f"after {after_s:.3f} s", Fork(GIVEN[name], place).ended(after_s, sign)
+    return ended.code not in FINISHED, told, [*_left(where, sent, ended, place), *_again(straight, name, place)]
+
+
+def _left(where: str, sent: str, ended: Ended, place: Path) -> Iterator[str]:
+    """What is wrong with the folder as it was left."""
+    yield from (f"unreadable: {fault}" for fault in unreadable(place / "run"))
+    if sent == "SIGKILL":
+        return
+    if ended.code not in (*FINISHED, TERMINATED, -signal.SIGTERM) or "Traceback" in ended.said:
+        yield f"exit code {ended.code}: {ended.said[-300:]}"
+    # a step may be that of tidying up itself: then the command given again does it
+    if where == "time" and strays(place):
+        yield f"left {strays(place)}"
+
+
+def _again(straight: Straight, name: str, place: Path) -> Iterator[str]:
+    """What is wrong with the folder after the command was given again."""
+    arguments = list(GIVEN[name])
+    if arguments[0] == "learn" and (place / "run").exists():
+        arguments.append("--resume")
+    ended = Fork(arguments, place).ended()
+    if ended.code not in FINISHED:
+        yield f"given again it ended with {ended.code}: {ended.said[-300:]}"
+        return
+    if strays(place):
+        yield f"given again it left {strays(place)}"
+    expected, found = straight.after[name], contents(place / "run")
+    yield from (f"{file} differs" for file in sorted({*expected, *found}) if expected.get(file) != found.get(file))
+    shutil.rmtree(place)
+
+
+def at_once(straight: Straight, name: str, number: int, place: Path) -> tuple[bool, str, list[str]]:
+    """Two commands at once: each works or is told why not, one works at least, and nothing is spoilt."""
+    before, first, second = PAIRS[name]
+    # the first time really at once
+    delay_s = np.random.default_rng([zlib.crc32(name.encode()), number]).uniform(0, LONGEST_DELAY_S) if number else 0.0
+    straight.before(before, place)
+    one = Fork(GIVEN[first], place)
+    time.sleep(delay_s)
+    other = Fork(GIVEN[second], place)
+    ends = [one.ended(), other.ended()]
+    faults = [] if any(end.code == 0 for end in ends) else ["neither worked"]
+    for end in ends:
+        if end.code not in (0, *REFUSED) or "Traceback" in end.said or "internal error" in end.said:
+            faults.append(f"exit code {end.code}: {end.said[-300:]}")
+    faults += [f"unreadable: {fault}" for fault in unreadable(place / "run")]
+    faults += [f"left {strays(place)}"] if strays(place) else []
+    found, whole = contents(place / "run"), straight.after["evaluate"]
+    faults += [f"{file} is missing" for file in straight.after["learn"] if file not in found]
+    faults += [f"{file} differs" for file in found if file in whole and found[file] != whole[file]]
+    shutil.rmtree(place)
+    return all(end.code == 0 for end in ends), f"{delay_s:.3f} s apart", faults

@@ -1,1 +1,0 @@
-"""The long runs that `make soak` does beside the suite: random whole runs, and learning from many seeds."""
