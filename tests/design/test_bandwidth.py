@@ -4,17 +4,15 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.rays import rays_along
 
 from lidardesign.errors import ConfigError
-from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import SPEED_OF_LIGHT_M_S
 from lidardesign.sensors.bandwidth import Bandwidth
 
 
 def rays_with_gates(gates):
-    count = len(gates)
-    forward = np.tile([1.0, 0.0, 0.0], (count, 1))
-    return Rays(np.zeros((count, 3)), forward, np.array(gates, float).reshape(-1, 2), np.zeros(count), np.zeros(count))
+    return rays_along(np.tile([1.0, 0.0, 0.0], (len(gates), 1)), np.reshape(gates, (-1, 2)))
 
 
 @pytest.mark.parametrize(("rays", "printed"), [(196, 5.2), (361, 9.5), (576, 15.2)])
@@ -29,11 +27,7 @@ def test_a_metre_of_gate_is_67_bins_of_100_picoseconds():
     assert Bandwidth().mbps(rays_with_gates([[0.5, 1.5]] * 196)) == pytest.approx(196 * 67 * 40 * 10 / 1e6)
 
 
-@given(
-    bins=st.integers(1, 100_000),
-    bin_ps=st.floats(0.1, 10_000.0),
-    start=st.floats(0.0, 100.0),
-)
+@given(bins=st.integers(1, 100_000), bin_ps=st.floats(0.1, 10_000.0), start=st.floats(0.0, 100.0))
 def test_a_gate_of_exactly_k_bins_costs_k_bins_after_a_trip_through_mean_and_spread(bins, bin_ps, start):
     model = Bandwidth(bin_ps=bin_ps)
     width = bins * SPEED_OF_LIGHT_M_S * bin_ps * 1e-12 / 2

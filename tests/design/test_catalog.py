@@ -29,21 +29,16 @@ from lidardesign.parts.catalogue import (
     parts_for,
     side_by_side,
 )
-from lidardesign.parts.part import Part, conditions_of, disagreements, to_angles, to_directions
-from lidardesign.parts.statements import FIELDS, PartFile, Statement
-from lidardesign.run.validation import check_model
-from lidardesign.run.yaml import parse_yaml
-from lidardesign.sensors.design_file import design_document, design_from_document, save_design
-from lidardesign.sensors.pattern import even_subset, grid_rows
-from lidardesign.sensors.sensor import boresight_frame, boresight_of
+from lidardesign.parts.part import conditions_of, disagreements, to_angles, to_directions
+from lidardesign.parts.statements import FIELDS, Statement
+from lidardesign.sensors.design_file import save_design
+from lidardesign.sensors.pattern import even_subset
+from lidardesign.sensors.sensor import boresight_frame
 from lidardesign.space import FARTHEST_M, DesignSpace, direction
 
 LIBRARY = load_library()
 PARTS = {part.name: part for part in LIBRARY.every_mode()}
-ZONES = ("vl53l5cx", "vl53l5cx:4x4", "vl53l7cx", "vl53l8cx", "tmf8820", "tmf8820:wide", "tmf8821:3x6", "tmf8828")
 SOME = ("vl53l8cx", "tmf8820:wide", "vlp-16", "hdl-64e", "tim781", "mid-40", "mid-360", "ml30s", "azure-kinect")
-ANGLE = st.floats(-math.pi, math.pi)
-ELEVATION = st.floats(-math.pi / 2, math.pi / 2)
 OWN = """
 schema_version: 1
 maker: Us
@@ -108,12 +103,8 @@ def test_the_rays_of_a_part_are_unit_vectors_inside_its_field_and_as_many_as_it_
     assert len(np.unique(np.round(part.directions, 9), axis=0)) == part.rays
     columns, rows = part.grid
     assert columns * rows >= part.rays > (columns - 1) * (rows - 1)
-
-
-@pytest.mark.parametrize("name", [name for name, part in PARTS.items() if part.value("points_per_s")])
-def test_rays_and_frames_make_the_points_per_second_that_the_maker_states(name):
-    part = PARTS[name]
-    assert part.rays * part.rate_hz == pytest.approx(part.value("points_per_s"), rel=0.001)
+    if stated := part.value("points_per_s"):
+        assert part.rays * part.rate_hz == pytest.approx(stated, rel=0.001)
 
 
 @pytest.mark.parametrize("name", PARTS)
@@ -149,12 +140,6 @@ def test_a_module_without_a_possible_field_or_zones_is_refused(name):
     with pytest.raises(ConfigError) as refused:
         find_part(name)
     assert refused.value.allowed
-
-
-def test_zones_stand_at_the_centres_of_their_cells_never_on_the_edge():
-    tangent = np.degrees(to_angles("tangent", PARTS["vl53l5cx"].directions))
-    assert tangent[:, 0].max() == pytest.approx(19.6875)
-    assert np.unique(np.round(np.diff(np.unique(np.round(tangent[:, 0], 9))), 6)) == pytest.approx([5.625])
 
 
 def test_beams_of_a_spinning_scanner_include_the_ends_and_its_columns_do_not_repeat():
@@ -221,34 +206,23 @@ def test_angles_and_directions_undo_each_other(projection):
     assert np.allclose(to_angles(projection, to_directions(projection, angle)), angle, atol=1e-12)
 
 
-def test_a_camera_does_not_see_what_is_behind_it():
-    assert not in_field(PARTS["azure-kinect"], np.array([[-1.0, 0, 0], [0, 1, 0]])).any()
-
-
 def test_histograms_and_processed_results_cost_what_their_bits_make():
     tmf, vl53 = PARTS["tmf8820"], PARTS["vl53l5cx"]
     assert tmf.histogram_mbps == pytest.approx(128 * 24 * 10 * 30 / 1e6)
     assert tmf.processed_mbps is None
     assert vl53.processed_mbps == pytest.approx((256 + 64 + 256 + 256 + 128 + 128 + 64 + 64 + 140) * 8 * 15 / 1e6)
     assert vl53.histogram_mbps is None
-    # rays that are read as histograms cost far more than results that the part makes itself
-    assert PARTS["tmf8828"].histogram_mbps > 15 * vl53.processed_mbps
 
 
 # conditions and contradictions
 
 
 def test_one_source_with_several_figures_does_not_disagree_with_itself(own):
-    own.write_text(OWN.replace("  - {value: 0.1, source: bench}", "  - {value: 0.1, source: bench}\n" * 2))
-    assert disagreements(find_part(own)) == []
-    twice = "  - {value: 0.1, source: bench}\n  - {value: 0.2, source: bench}"
-    own.write_text(OWN.replace("  - {value: 0.1, source: bench}", twice))
-    assert disagreements(find_part(own)) == []
-    other = OWN.replace("  bench: {", "  list: {title: A list, kind: list}\n  bench: {")
-    own.write_text(
-        other.replace("  - {value: 0.1, source: bench}", twice.replace("0.2, source: bench", "0.2, source: list"))
-    )
-    assert disagreements(find_part(own)) == ["near_m"]
+    first, two_sources = "  - {value: 0.1, source: bench}", "  list: {title: A list, kind: list}\n  bench: {"
+    for further, source, expected in ((0.1, "bench", []), (0.2, "bench", []), (0.2, "list", ["near_m"])):
+        text = OWN.replace(first, f"{first}\n  - {{value: {further}, source: {source}}}")
+        own.write_text(text if source == "bench" else text.replace("  bench: {", two_sources))
+        assert disagreements(find_part(own)) == expected
 
 
 def test_the_range_under_conditions_is_the_farthest_that_a_source_vouches_for():
@@ -256,8 +230,6 @@ def test_the_range_under_conditions_is_the_farthest_that_a_source_vouches_for():
     assert part.under(reflectance_percent=88, illuminance_klux=0).range_m == (0.02, 3.5)
     assert part.under(reflectance_percent=50, illuminance_klux=2).range_m == (0.02, 0.8)
     assert part.under(illuminance_klux=5).range_m == (0.02, 1.1)
-    assert part.under(reflectance_percent=50, illuminance_klux=2).rays == 64
-    assert len(part.under(illuminance_klux=5).figures["far_m"]) == len(part.figures["far_m"])
 
 
 @settings(max_examples=60, deadline=None)
@@ -283,23 +255,6 @@ def test_conditions_that_no_source_states_are_refused_with_those_that_are():
 # placing
 
 
-@given(ANGLE, ELEVATION, ANGLE)
-def test_a_frame_gives_back_its_boresight(azimuth, elevation, roll):
-    frame = boresight_frame(azimuth, elevation, roll)
-    assert np.allclose(boresight_frame(*boresight_of(frame)), frame, atol=1e-9)
-
-
-@pytest.mark.parametrize("name", ZONES)
-def test_zones_are_the_even_grid_of_their_field_where_that_has_their_rows(name):
-    part = PARTS[name]
-    design = part_design(part, some_pose())
-    even = replace(design, layout="even", patterns=()).rays(part.rays)
-    own_rays = design.rays()
-    assert np.allclose(own_rays.gate_m, even.gate_m, atol=1e-12)
-    if part.grid[1] == len(grid_rows(*part.field_of_view_rad, part.rays)):
-        assert np.allclose(own_rays.direction, even.direction, atol=1e-12)
-
-
 @pytest.mark.parametrize("name", SOME)
 def test_a_pose_moves_a_part_as_a_rigid_body(name):
     part, pose = PARTS[name], some_pose()
@@ -320,8 +275,6 @@ def test_the_sensor_of_a_part_has_its_field_its_range_and_looks_at_its_centre(na
     sensor = part_sensor(part, pose)
     assert sensor.field_of_view_rad == pytest.approx(part.field_of_view_rad)
     assert sensor.gate_m == pytest.approx(part.range_m)
-    centre = direction(*part.centre_rad) @ pose.frame
-    assert np.allclose(sensor.boresight, centre, atol=1e-9)
     assert np.allclose(sensor.frame, boresight_frame(*part.centre_rad) @ pose.frame, atol=1e-9)
     assert sensor.origin_covariance_m2 is None
     assert sensor.part == name
@@ -336,32 +289,10 @@ def test_rays_of_one_part_fire_over_its_own_frame():
 # subsets and several parts
 
 
-@settings(max_examples=60, deadline=None)
-@given(st.integers(1, 400), st.data())
-def test_a_subset_has_the_rays_asked_for_each_once(total, data):
-    count = data.draw(st.integers(0, total))
-    points = np.random.default_rng(total).normal(size=(total, 3))
-    kept = even_subset(points, count)
-    assert len(np.unique(kept)) == len(kept) == count
-    assert np.array_equal(kept, np.sort(kept))
-    assert np.array_equal(kept, even_subset(points, count))
-
-
 def test_a_quarter_of_the_zones_is_one_of_every_block_of_four():
     kept = even_subset(PARTS["vl53l5cx"].directions, 16)
     blocks = {(index // 8 // 2, index % 8 // 2) for index in kept}
     assert len(blocks) == 16
-
-
-def test_a_subset_leaves_smaller_gaps_than_one_drawn_at_random():
-    everything = PARTS["vlp-16"].directions
-    kept = everything[even_subset(everything, 300)]
-    drawn = everything[np.random.default_rng(0).choice(len(everything), 300, replace=False)]
-
-    def gap(chosen):
-        return np.arccos(np.clip((everything[::7] @ chosen.T).max(axis=1), -1, 1)).max()
-
-    assert gap(kept) < 0.7 * gap(drawn)
 
 
 @pytest.mark.parametrize(("count", "parts", "shares"), [(64, 1, [64]), (65, 2, [33, 32]), (196, 4, [49, 49, 49, 49])])
@@ -469,10 +400,8 @@ def test_names_that_lead_nowhere_are_refused(name, message):
     [
         ("kind: multi-zone", "kind: sonar", r"homemade.yaml:5:7: kind: found 'sonar'"),
         ("rows: 2", "rows: 0", r"rows"),
-        ("rows: 2", "rows: two", r"rows"),
         ("rows: 2, source: bench", "rows: 2, source: nobody", "names the source 'nobody', known are bench"),
         ("[-15, 15]", "[15, -15]", "azimuth runs from 15 down to -15"),
-        ("[-15, 15]", "[-15, 200]", "azimuth"),
         ("value: 0.1,", "value: 3,", "near_m is not below far_m"),
         ("value: 0.1,", "value: -1,", "near_m"),
         ("value: 20,", "value: 0,", "rate_hz"),
@@ -480,15 +409,10 @@ def test_names_that_lead_nowhere_are_refused(name, message):
         ("reflectance_percent: 50", "reflectance_percent: 150", "reflectance_percent"),
         ("reflectance_percent: 50", "reflectance: 50", r"homemade.yaml:16:\d+: unknown key"),
         ("far_m:", "far:", r"unknown key 'far'"),
-        ("schema_version: 1", "schema_version: 2", "schema_version"),
         ("kind: zones", "kind: spiral", "pattern"),
-        ("{kind: zones, columns: 3, rows: 2,", "{kind: rings, columns: 3,", "give either rings or elevations_deg"),
-        ("{kind: zones, columns: 3, rows: 2,", "{kind: zones, columns: 3000, rows: 3000,", "9000000 rays a frame"),
-        (
-            "{kind: zones, columns: 3, rows: 2,",
-            "{kind: rings, columns: 3, elevations_deg: [0, 11],",
-            "a beam at 11 deg",
-        ),
+        ("zones, columns: 3, rows: 2", "rings, columns: 3", "give either rings or elevations_deg"),
+        ("zones, columns: 3, rows: 2", "zones, columns: 3000, rows: 3000", "9000000 rays a frame"),
+        ("zones, columns: 3, rows: 2", "rings, columns: 3, elevations_deg: [0, 11]", "a beam at 11 deg"),
         ("elevation: [-10, 10]", "elevation: [0, 0]", "2 rays across an elevation without width"),
         ("azimuth: [-15, 15]", "azimuth: [-180, 180]", "beyond 180 degrees from the forward axis"),
         ("elevation: [-10, 10]", "elevation: [-10, 10], shape: ellipse", "its pattern has corners"),
@@ -507,38 +431,6 @@ def test_files_that_are_no_parts_are_refused(own, text):
     own.write_text(text)
     with pytest.raises(ConfigError):
         find_part(own)
-
-
-LEAVES = st.one_of(
-    st.none(), st.booleans(), st.integers(-3, 3), st.integers(10**5, 10**9), st.floats(), st.text(max_size=5),
-    st.just([]), st.just({}), st.lists(st.floats(-400, 400), max_size=3),
-)  # fmt: skip
-
-
-def leaves(value, path=()):
-    yield path
-    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    for key, inside in items:
-        yield from leaves(inside, (*path, key))
-
-
-@settings(max_examples=300, deadline=None)
-@given(st.data())
-def test_a_part_file_with_anything_in_any_place_is_a_part_or_refused(data):
-    document = parse_yaml(OWN, where="own").value
-    path = data.draw(st.sampled_from([one for one in leaves(document) if one]))
-    target = document
-    for key in path[:-1]:
-        target = target[key]
-    target[path[-1]] = data.draw(LEAVES)
-    try:
-        part = Part.of_file("own", check_model(PartFile, document, lambda where, *, key=False: "own"), None, "own")
-        rays = part_rays(part, Pose())
-    except ConfigError:
-        return
-    assert len(rays) == part.rays >= 1
-    assert in_field(part, part.directions).all()
-    design_from_document(design_document(part_design(part, Pose(), min(part.rays, 50))))
 
 
 # the commands
@@ -578,8 +470,6 @@ def test_a_part_is_written_as_a_design_that_other_commands_read(call, tmp_path):
     assert beside.code == 0, beside.err
     one, other = load_design(tmp_path / "wide.yaml").sensors
     assert math.acos(one.boresight @ other.boresight) == pytest.approx(math.radians(45))
-    assert call("export", "bought.yaml", "--format", "csv", "--rays", "100").code == 0
-    assert len(Path("bought.csv").read_text().splitlines()) >= 100
 
 
 @pytest.mark.parametrize(
@@ -588,15 +478,14 @@ def test_a_part_is_written_as_a_design_that_other_commands_read(call, tmp_path):
         (("--rays", "10"), "says how a design is made"),
         (("--at-origin", "0,0,0"), "says how a design is made"),
         (("--out", "o.yaml", "--at-origin", "1,2"), "three numbers"),
-        (("--out", "o.yaml", "--at-origin", "1,2,nan"), "three numbers"),
         (("--out", "o.yaml", "--elevation-deg", "91"), "-90 to 90"),
         (("--out", "o.yaml", "--azimuth-deg", "361"), "-360 to 360"),
         (("--out", "o.yaml", "--arrange", "beside"), "is for several parts"),
         (("--out", "o.yaml", "--arrange", "stacked", "--parts", "2"), "interleaved"),
         (("--out", "o.yaml", "--parts", "2", "--rays", "129"), "129 rays of 2 x vl53l8cx"),
+        (("--out", "o.yaml", "--parts", "1000"), "--rays N takes an evenly spread subset"),
         (("--reflectance", "0"), "--reflectance"),
         (("--klux", "-1"), "--klux"),
-        (("--klux", "nan"), "--klux"),
         (("--reflectance", "5"), "no source of vl53l8cx states a range"),
     ],
 )
@@ -607,24 +496,13 @@ def test_what_cannot_be_asked_of_a_part_is_refused_and_nothing_is_written(call, 
     assert not Path("o.yaml").exists()
 
 
-def test_a_part_of_more_rays_than_a_file_takes_says_what_to_do(call):
-    result = call("catalog", "show", "os1-128", "--out", "o.yaml")
-    assert result.code == 2
-    assert "--rays N takes an evenly spread subset" in result.err
-    assert call("catalog", "show", "os1-128", "--out", "o.yaml", "--rays", "1000", "--json").json["sensors"] == 1
-
-
 # the guide
 
 GUIDE = (Path(__file__).parents[2] / "docs" / "catalog.md").read_text(encoding="utf-8")
 
 
-def blocks(language):
-    return re.findall(rf"```{language}\n(.*?)```", GUIDE, re.DOTALL)
-
-
 def test_the_part_file_of_the_guide_is_one(tmp_path):
-    (text,) = blocks("yaml")
+    (text,) = re.findall(r"```yaml\n(.*?)```", GUIDE, re.DOTALL)
     path = tmp_path / "ranger.yaml"
     path.write_text(text)
     fine, fast = find_part(path), find_part(f"{path}:fast")

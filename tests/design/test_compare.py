@@ -10,10 +10,12 @@ import pytest
 from support.command_line import make_run
 from support.sensors import normal_sensor
 
+from lidardesign import open_run
 from lidardesign.formats.designs import load_design
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.compare import angles_between, difference, paired_sensors, readout_of
 from lidardesign.sensors.design import DesignSpec
+from lidardesign.sensors.design_file import save_design
 from lidardesign.sensors.pattern import Pattern
 from lidardesign.space import direction
 
@@ -95,36 +97,30 @@ def test_what_a_design_costs_along_a_condition_is_from_its_cheapest_to_its_deare
 # ------------------------------------------------------------------- commands
 
 
-EVEN = ("--layout", "even", "--sensors", "2")
-
-
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    folder = make_run(tmp_path_factory.mktemp("runs") / "flat", count=2000)
-    from lidardesign.cli.main import run as program
-
-    for name, rays in (("few", 8), ("more", 12)):
-        with pytest.raises(SystemExit) as ended:
-            program(["fit", str(folder), *EVEN, "--rays", str(rays), "--name", name, "--quiet"])
-        assert not ended.value.code
-    return folder
+    """A run with a fitted design, one of more rays, and one under constraints."""
+    opened = open_run(make_run(tmp_path_factory.mktemp("runs") / "flat", count=2000))
+    options = {"sensors": 2, "layout": "even", "rays": 8}
+    few = opened.fit(**options, name="few")
+    few.save()
+    more = replace(few.specification, name="more", constraints={"budget": {"rays": 12}})
+    save_design(more, opened.folder / "designs" / "more.yaml")
+    tight = {"gate": {"width_m": {"max": 0.2}}, "budget": {"bandwidth_mbps": 900}}
+    opened.fit(constraints=tight, **options, name="tight").save()
+    return opened.folder
 
 
 def test_two_designs_differ_in_what_is_shown(call, run):
-    constrained = call("constrain", run, *EVEN, "--rays", "8", "--set", "gate.width_m.max=0.2", "--name", "tight")
-    assert constrained.code == 0, constrained.err
     few, more, tight = (run / "designs" / f"{name}.yaml" for name in ("few", "more", "tight"))
     found = call("show", few, tight, "--json").json
     assert [design["name"] for design in found["designs"]] == ["few", "tight"]
-    assert found["constraints"] == {"gate.width_m.max": [None, 0.2]}
-    assert found["sensors"] == [
-        difference(*pair) for pair in paired_sensors(*(load_design(path) for path in (few, tight)))
-    ]
+    assert found["constraints"] == {"budget.bandwidth_mbps": [None, 900], "gate.width_m.max": [None, 0.2]}
+    pairs = paired_sensors(*(load_design(path) for path in (few, tight)))
+    assert found["sensors"] == [difference(*pair) for pair in pairs]
     assert "gate.width_m.max" in call("show", few, tight).out
     assert [design["bandwidth"]["rays"] for design in call("show", few, more, "--json").json["designs"]] == [8, 12]
-    itself = call("show", few, few, "--json").json
-    assert itself["constraints"] == {}
-    assert not any(value for pair in itself["sensors"] for value in pair["difference"].values())
+    assert call("show", few, few, "--json").json["constraints"] == {}
     assert call("show", few, run).code == 3
 
 
@@ -139,24 +135,16 @@ def test_what_rounding_leaves_of_no_difference_is_shown_as_none(call, run, tmp_p
 
 
 def test_a_shown_design_says_how_tight_its_constraints_are(call, run):
-    result = call(
-        "constrain", run, *EVEN, "--set", "gate.width_m.max=0.2", "--set", "budget.bandwidth_mbps=900", "--rays", "8"
-    )
-    assert result.code == 0, result.err
-    path = run / "designs" / "constrained.yaml"
-    shown = call("show", path, "--json").json
+    shown = call("show", run / "designs" / "tight.yaml", "--json").json
     checks = {check["name"]: check for check in shown["checks"]}
     budget = checks["budget.bandwidth_mbps"]
     assert budget["room"] == pytest.approx(900 - shown["bandwidth"]["high_mbps"])
     assert not budget["tight"]
-    widths = [check for name, check in checks.items() if name.endswith("gate.width_m.max")]
-    assert any(check["tight"] for check in widths)
+    assert any(check["tight"] for name, check in checks.items() if name.endswith("gate.width_m.max"))
     assert all(check["satisfied"] for check in checks.values())
     # the run's design space is checked too, where it is there
     assert any(".space." in name for name in checks)
-    text = call("show", path).out
-    assert "yes, tight" in text
-    assert "Mbit/s for 8 rays per frame" in text
+    assert "yes, tight" in call("show", run / "designs" / "tight.yaml").out
     # nothing was asked of this one but its number of rays
     plain = call("show", run / "designs" / "few.yaml", "--json").json["checks"]
     assert [check["name"] for check in plain if ".space." not in check["name"]] == ["budget.rays"]

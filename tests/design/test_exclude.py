@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-import copy
-import json
 import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from support import fits
-from support.command_line import make_run
+from support.sensors import normal_sensor
 
 from lidardesign.constraints.check import check_design
 from lidardesign.constraints.document import Constraints
 from lidardesign.constraints.origins import placement_notes
-from lidardesign.errors import ConfigError, InfeasibleError
+from lidardesign.errors import InfeasibleError
 from lidardesign.rays.proposals import Proposals
 from lidardesign.samples import Samples
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import design_document
-from lidardesign.sensors.pattern import Pattern
 from lidardesign.space import DesignSpace, aim, observed_point
 
 ROOM = DesignSpace((-1, -1, 0, 0.0, -math.pi / 2, 0.05), (1, 1, 2, 2 * math.pi, math.pi / 2, 6.0))
@@ -35,20 +30,17 @@ def log_target(points):
     return -0.5 * np.square((observed_point(points) - CENTRE) / WIDTH).sum(axis=-1)
 
 
-def room(count=12_000, seed=0, space=ROOM):
+def room(count=6000):
     """Samples of the density of a blob in the middle of the room."""
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(0)
     scene = CENTRE + WIDTH * generator.standard_normal((count, 3))
-    origin = generator.uniform(space.low[:3], space.high[:3], (count, 3))
-    points = aim(origin, scene)
-    points = points[space.contains(points)]
+    points = aim(generator.uniform(ROOM.low[:3], ROOM.high[:3], (count, 3)), scene)
+    points = points[ROOM.contains(points)]
     target = log_target(points)
-    return Samples(points, target + 2 * np.log(points[:, 5]), target, space)
+    return Samples(points, target + 2 * np.log(points[:, 5]), target, ROOM)
 
 
 SAMPLES = room()
-
-
 REGION = {"spread_m": {"max": 9.0}}
 
 
@@ -58,6 +50,10 @@ def fitted(samples=SAMPLES, count=None, rays=None, **values):
 
 def broken(found, **values):
     return fits.broken(found, values, ROOM)
+
+
+def box_checks(found, values):
+    return [check.name for check in fits.checks(found, values, ROOM) if "exclude" in check.name]
 
 
 def interval(sensor):
@@ -75,16 +71,6 @@ def assert_outside(found, boxes):
             assert not into.all(), (sensor.origin_m, low, high, box)
 
 
-def candidates(found, count, **values):
-    """Rays that are proposed for fitted sensors."""
-    rules = Constraints.from_mapping(values).rules
-    return Proposals(found.sensors, rules, 0.95, SAMPLES).draw(count, {}, np.random.default_rng(0))
-
-
-def starting_in(box, rays):
-    return ((rays.origin_m > box["low_m"]) & (rays.origin_m < box["high_m"])).all(axis=1).any()
-
-
 def places(found):
     return [(*sensor.origin_m, *sensor.covariance_m2.ravel()) for sensor in found.sensors]
 
@@ -95,23 +81,17 @@ def test_no_sensor_and_no_ray_is_in_an_excluded_box(region, box):
     origin = {"exclude": [box], **region}
     found = fitted(origin=origin)
     assert_outside(found, [box])
-    assert not starting_in(box, candidates(found, 200, origin=origin))
-    checks = fits.checks(found, {"origin": origin}, ROOM)
-    assert all(check.satisfied for check in checks)
-    assert [check.name for check in checks if "exclude" in check.name] == [f"s{i}.origin.exclude[0]" for i in range(4)]
+    rules = Constraints.from_mapping({"origin": origin}).rules
+    start_m = Proposals(found.sensors, rules, 0.95, SAMPLES).draw(200, {}, np.random.default_rng(0)).origin_m
+    assert not ((start_m > box["low_m"]) & (start_m < box["high_m"])).all(axis=1).any()
+    assert broken(found, origin=origin) == []
+    assert box_checks(found, {"origin": origin}) == [f"s{i}.origin.exclude[0]" for i in range(4)]
 
 
 def test_the_admissible_mass_is_the_density_outside():
     found = fitted(origin={"exclude": [SLAB], **REGION})
     outside = (SAMPLES.points[:, 0] <= -0.3) | (SAMPLES.points[:, 0] >= 0.2)
     assert found.admissible_mass == pytest.approx(SAMPLES.weights[outside].sum())
-
-
-def test_boxes_beyond_the_space_change_nothing():
-    free = fitted(count=2, origin=REGION)
-    far = fitted(count=2, origin={"exclude": [{"low_m": [3, -9, -9], "high_m": [5, 9, 9]}], **REGION})
-    assert places(far) == places(free)
-    assert far.log_likelihood == free.log_likelihood
 
 
 @pytest.mark.parametrize("axis", range(3))
@@ -126,27 +106,9 @@ def test_flat_boxes_exclude_nothing_and_it_is_said(axis):
     assert notes == ("origin.exclude[0] has no volume and excludes nothing",)
 
 
-def test_each_sensor_may_have_boxes_of_its_own():
-    left, right = {"low_m": [-2, -2, -1], "high_m": [0, 2, 3]}, {"low_m": [0, -2, -1], "high_m": [2, 2, 3]}
-    values = {"origin": REGION, "each": [{"origin": {"exclude": [left]}}, {"origin": {"exclude": [right]}}]}
-    found = fitted(**values)
-    first, second = found.sensors
-    assert interval(first)[0][0] >= -1e-9
-    assert interval(second)[1][0] <= 1e-9
-    assert broken(found, **values) == []
-
-
 def test_an_entry_of_each_replaces_the_common_boxes():
     values = {"origin": {"exclude": [SLAB]}, "each": [{"origin": {"exclude": []}}, {}]}
-    names = [check.name for check in fits.checks(fitted(**values), values, ROOM)]
-    assert [name for name in names if "exclude" in name] == ["s1.origin.exclude[0]"]
-
-
-def test_boxes_hold_together_with_spreads():
-    origin = {"exclude": [PILLAR], "spread_m": {"max": 0.3}, "thickness_m": {"max": 0.02}}
-    found = fitted(count=4, origin=origin)
-    assert_outside(found, [PILLAR])
-    assert broken(found, origin=origin) == []
+    assert box_checks(fitted(**values), values) == ["s1.origin.exclude[0]"]
 
 
 def test_mounts_in_an_excluded_box_are_dropped_and_it_is_said():
@@ -166,74 +128,36 @@ def test_a_sensor_may_sit_on_the_surface_of_a_box():
     assert broken(found, origin=origin) == []
 
 
-@pytest.mark.parametrize(
-    ("values", "conflicts"),
-    [
-        ({"origin": {"exclude": [PILLAR], "fixed_m": [0, 0, 1]}}, ["origin.exclude[0]", "origin.fixed_m"]),
-        (
-            {"origin": {"exclude": [SLAB, PILLAR], "low_m": [-0.2, -1, 0], "high_m": [0.1, 1, 2]}},
-            ["origin.exclude[0]", "origin.low_m", "origin.high_m"],
-        ),
-        (
-            {"origin": {"exclude": [SLAB, {"low_m": [0.1, -5, -5], "high_m": [3, 5, 5]}], "low_m": [-0.2, -1, 0]}},
-            ["origin.exclude", "origin.low_m"],
-        ),
-        (
-            {"origin": {"exclude": [{"low_m": [-2, -2, -2], "high_m": [2, 2, 2]}]}},
-            ["origin.exclude[0]", "space.x_m", "space.y_m", "space.z_m"],
-        ),
-        (
-            {"origin": {"exclude": [PILLAR], "mounts_m": [[0, 0, 1], [0.1, 0, 1]]}},
-            ["origin.mounts_m", "origin.exclude"],
-        ),
-        (
-            {"sensors": {"count": 2}, "origin": {"exclude": [PILLAR], "mounts_m": [[0, 0, 1], [0.7, 0, 1]]}},
-            ["sensors.count", "origin.mounts_m", "origin.exclude"],
-        ),
-        (
-            {"origin": {"exclude": [PILLAR]}, "each": [{}, {"origin": {"fixed_m": [0, 0, 1]}}]},
-            ["origin.exclude[0]", "each[1].origin.fixed_m"],
-        ),
-        (
-            {"sensors": {"count": 2}, "origin": {"exclude": [PILLAR], "fixed_m": [0, 0, 1]}, "each": [{}]},
-            ["origin.exclude[0]", "origin.fixed_m"],
-        ),
-    ],
-)  # fmt: skip
+def without(*boxes, **origin):
+    return {"exclude": list(boxes), **origin}
+
+
+NARROW = {"low_m": [-0.2, -1, 0], "high_m": [0.1, 1, 2]}
+RIGHT = {"low_m": [0.1, -5, -5], "high_m": [3, 5, 5]}
+EVERYTHING = {"low_m": [-2, -2, -2], "high_m": [2, 2, 2]}
+INSIDE = {"fixed_m": [0, 0, 1]}
+TWO = {"count": 2}
+BOX, BOXES, SPACE = "origin.exclude[0]", "origin.exclude", ("space.x_m", "space.y_m", "space.z_m")
+CONFLICTS = [
+    ({"origin": without(PILLAR, **INSIDE)}, [BOX, "origin.fixed_m"]),
+    ({"origin": without(SLAB, PILLAR, **NARROW)}, [BOX, "origin.low_m", "origin.high_m"]),
+    ({"origin": without(SLAB, RIGHT, low_m=[-0.2, -1, 0])}, [BOXES, "origin.low_m"]),
+    ({"origin": without(EVERYTHING)}, [BOX, *SPACE]),
+    ({"origin": without(PILLAR, mounts_m=[[0, 0, 1], [0.1, 0, 1]])}, ["origin.mounts_m", BOXES]),
+    (
+        {"sensors": TWO, "origin": without(PILLAR, mounts_m=[[0, 0, 1], [0.7, 0, 1]])},
+        ["sensors.count", "origin.mounts_m", BOXES],
+    ),
+    ({"origin": without(PILLAR), "each": [{}, {"origin": INSIDE}]}, [BOX, "each[1].origin.fixed_m"]),
+    ({"sensors": TWO, "origin": without(PILLAR, **INSIDE), "each": [{}]}, [BOX, "origin.fixed_m"]),
+]
+
+
+@pytest.mark.parametrize(("values", "conflicts"), CONFLICTS)
 def test_boxes_that_leave_no_place_are_refused_by_name(values, conflicts):
     with pytest.raises(InfeasibleError) as caught:
         fitted(**values)
     assert list(caught.value.conflicts) == conflicts
-
-
-@pytest.mark.parametrize(
-    ("boxes", "message"),
-    [
-        ([{"low_m": [0, 0, 1], "high_m": [1, 1, 0]}], "low_m is above high_m along z"),
-        ([{"low_m": [0, 0, math.nan], "high_m": [1, 1, 1]}], "finite"),
-        ([{"low_m": [0, 0], "high_m": [1, 1, 1]}], "at least 3"),
-        ([{"low_m": [0, 0, 0, 0], "high_m": [1, 1, 1]}], "at most 3"),
-        ([{"low_m": [0, 0, 0]}], "high_m is missing"),
-        ([{"low_m": [0, 0, 0], "high_m": [1, 1, 1], "heigh_m": 3}], "unknown key"),
-        ([{"low_m": ["a", 0, 0], "high_m": [1, 1, 1]}], "number"),
-        ([[0, 0, 0, 1, 1, 1]], "origin.exclude.0"),
-        ([SLAB] * 33, "32"),
-    ],
-)
-def test_boxes_that_are_none_and_too_many_are_refused(boxes, message):
-    with pytest.raises(ConfigError, match=message):
-        Constraints.from_mapping({"origin": {"exclude": boxes}})
-
-
-@pytest.mark.parametrize("region", [{}, REGION], ids=["places", "regions"])
-def test_a_pinned_coordinate_is_in_a_box_or_not(region):
-    origin = {"low_m": [-1, -1, 0.4], "high_m": [1, 1, 0.4], "exclude": [PILLAR], **region}
-    found = fitted(count=2, origin=origin)
-    assert broken(found, origin=origin) == []
-    assert_outside(found, [PILLAR])
-    origin = {"low_m": [-1, -1, 1.8], "high_m": [1, 1, 1.8], **region}
-    above = fitted(count=2, origin=origin | {"exclude": [PILLAR]})
-    assert places(above) == places(fitted(count=2, origin=origin))
 
 
 @pytest.mark.parametrize("region", [{}, REGION], ids=["places", "regions"])
@@ -267,101 +191,25 @@ def test_far_from_the_origin_of_coordinates_nothing_changes(region):
         np.testing.assert_allclose(one.origin_m - shift, other.origin_m, atol=1e-3)
 
 
-# --- the independent checker
-
-
-@pytest.fixture(scope="module")
-def document():
-    origin = {"exclude": [PILLAR], **REGION}
-    found = fitted(count=2, origin=origin)
-    patterns = (Pattern.of(candidates(found, 20, origin=origin)),)
-    return design_document(DesignSpec("d", found.sensors, "fixed", patterns, {"origin": origin}))
-
-
-def broken_boxes(document):
-    checks = check_design(document, document["constraints"], ROOM)
-    return [check.name for check in checks if not check.satisfied and "exclude" in check.name]
-
-
 @pytest.mark.parametrize(
     ("mean_x", "spread_x", "names"),
     [(0.0, 0.0, ["s1.origin.exclude[0]"]), (0.7, 0.1, []), (0.7, 0.11, ["s1.origin.exclude[0]"])],
 )
-def test_a_mean_in_a_box_and_an_interval_that_reaches_into_it_are_seen(document, mean_x, spread_x, names):
-    moved = copy.deepcopy(document)
-    moved["sensors"][1]["origin_m"] = {"mean": [mean_x, 0.0, 1.0], "covariance": np.diag([spread_x**2, 0, 0]).tolist()}
-    assert broken_boxes(moved) == names
+def test_a_mean_in_a_box_and_an_interval_that_reaches_into_it_are_seen(mean_x, spread_x, names):
+    moved = normal_sensor("s1", 0.5, (mean_x, 0, 1), origin_covariance_m2=np.diag([spread_x**2, 0, 0]))
+    sensors = (normal_sensor("s0", 0.5, (0.7, 0, 1)), moved)
+    checks = check_design(design_document(DesignSpec("d", sensors)), {"origin": {"exclude": [PILLAR]}}, ROOM)
+    assert [check.name for check in checks if not check.satisfied and "exclude" in check.name] == names
 
 
-def test_a_ray_that_starts_in_a_box_is_seen(document):
-    assert broken_boxes(document) == []
-    moved = copy.deepcopy(document)
-    (pattern,) = moved["patterns"]
-    for key in ("origin_x_m", "origin_y_m"):
-        pattern[key][0][7] = 0.0
-    pattern["origin_z_m"][0][7] = 1.4999
-    assert broken_boxes(moved) == ["ray7.origin.exclude[0]"]
-    pattern["origin_z_m"][0][7] = 1.5
-    assert broken_boxes(moved) == []
-
-
-def test_a_ray_that_passes_through_a_box_on_its_way_along_a_condition_is_seen(document):
-    moved = copy.deepcopy(document)
-    (pattern,) = moved["patterns"]
-    for key, column in pattern.items():
-        if key != "sensor":
-            pattern[key] = column * 2
-    pattern |= {"dimension": "x_m", "knots_m": [-1.0, 1.0]}
-    pattern["origin_x_m"], count = [[-1.0] * 20, [1.0] * 20], 20
-    for y_m, expected in ((0.6, []), (0.0, [f"ray{ray}.origin.exclude[0]" for ray in range(count)])):
-        pattern["origin_y_m"], pattern["origin_z_m"] = [[y_m] * count] * 2, [[1.0] * count] * 2
-        assert broken_boxes(moved) == expected
-
-
-# --- the command line
-
-
-EVEN = ("--layout", "even", "--sensors", 2)
-
-
-def test_boxes_are_given_by_option_and_by_file(call, tmp_path):
-    make_run(tmp_path / "run")
-    box = "[{low_m: [-9, -9, -9], high_m: [0.5, 9, 9]}]"
-    result = call("constrain", "run", *EVEN, "--set", f"origin.exclude={box}", "--json", "--name", "right")
+def test_boxes_are_given_by_option_and_by_file(call, flat, tmp_path):
+    (tmp_path / "rules.yaml").write_text("origin:\n  exclude: [{low_m: [-9, -9, -9], high_m: [0.5, 9, 9]}]\n")
+    options = ["--constraints", "rules.yaml", "--set", "origin.exclude.0.high_m=[0.6, 9, 9]"]
+    result = call("constrain", flat, "--layout", "even", "--sensors", 2, *options, "--json")
     assert result.code == 0, result.err
     rows = [row for row in result.json["constraints"] if "exclude" in row["name"]]
-    assert rows
-    assert all(row["satisfied"] and row["value"]["low_m"][0] >= 0.5 for row in rows)
-    (tmp_path / "rules.yaml").write_text(f"origin:\n  exclude: {box}\n")
-    options = ["--constraints", "rules.yaml", "--set", "origin.exclude.0.high_m=[0.6, 9, 9]"]
-    result = call("constrain", "run", *EVEN, *options, "--json")
-    assert result.code == 0, result.err
-    rows = [row for row in json.loads(result.out)["constraints"] if "exclude" in row["name"]]
+    assert len(rows) == 2
+    assert all(row["satisfied"] and row["value"]["low_m"][0] >= 0.6 for row in rows)
     assert rows[0]["bound"]["high_m"] == [0.6, 9, 9]
-    shown = call(
-        "constrain", "run", "--layout", "even", "--constraints", "rules.yaml", "--set", "sensors.count=1", "-v"
-    )
-    assert "s0.origin.exclude[0]" in shown.out
-    assert "low_m [-9, -9, -9], high_m [0.5, 9, 9]" in shown.out
-    again = call("constrain", "run/designs/right.yaml", "--json")
-    assert again.code == 0, again.err
-
-
-side = st.floats(-1.2, 1.2).map(lambda value: round(value, 3))
-corner = st.tuples(side, side, side.map(lambda value: value + 1))
-box = st.tuples(corner, corner).map(
-    lambda pair: {"low_m": np.minimum(*pair).tolist(), "high_m": np.maximum(*pair).tolist()}
-)
-
-
-@settings(max_examples=15, deadline=None)
-@given(st.lists(box, min_size=1, max_size=4), st.integers(1, 3), st.sampled_from([{}, REGION]))
-def test_whatever_the_boxes_nothing_is_inside_one(boxes, sensors, region):
-    origin = {"exclude": boxes, **region}
-    try:
-        found = fitted(count=sensors, origin=origin)
-    except InfeasibleError:
-        return
-    assert broken(found, origin=origin) == []
-    assert_outside(found, boxes)
-    assert not any(starting_in(one, candidates(found, 40, origin=origin)) for one in boxes)
+    shown = call("show", "run/designs/constrained.yaml")
+    assert "low_m [-9, -9, -9], high_m [0.6, 9, 9]" in shown.out

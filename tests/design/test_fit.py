@@ -11,7 +11,6 @@ from support.fits import CENTRE, FACE, FIXED, FREE, MOVING, blob, broken, checks
 
 from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.mixture.em import LEAST_SAMPLES
-from lidardesign.sensors.bandwidth import split_budget
 from lidardesign.sensors.sensor import interval_factor, tangent_coordinates
 from lidardesign.space import aim, direction, observed_point
 
@@ -116,15 +115,6 @@ def test_a_field_of_view_that_may_not_hold_everything_is_that_of_the_sensors_own
     assert apart[np.triu_indices(4, 1)].max() > 4
 
 
-def test_each_entry_rules_its_own_sensor():
-    rules = {"each": [{"boresight": {"azimuth_deg": {"max": -2}}}, {"boresight": {"azimuth_deg": {"min": 2}}}]}
-    found = fitted(FIXED, rules)
-    assert broken(found, rules, FACE) == []
-    turned = [math.degrees(math.remainder(sensor.azimuth_rad, 2 * math.pi)) for sensor in found.sensors]
-    assert turned[0] <= -2
-    assert turned[1] >= 2
-
-
 def test_a_bandwidth_budget_narrows_the_gates_until_it_holds():
     free = fitted(FIXED, sensors=3, rays=100)
     limit = 0.04 * 4
@@ -201,11 +191,3 @@ def test_errors_of_a_fit_are_its_spread_over_other_samples():
         stated = np.mean([one[name].error for one in fits])
         # a standard deviation of so many values is known to 9 %
         assert stated == pytest.approx(spread, rel=4 / math.sqrt(2 * repeats)), name
-
-
-@pytest.mark.parametrize("rays", [7, 100])
-def test_whole_rays_are_off_by_less_than_half_a_ray_per_sensor(rays):
-    weights = np.array([sensor.weight for sensor in fitted(FIXED, sensors=3).sensors])
-    shares = split_budget(weights, rays)
-    assert shares.sum() == rays
-    assert np.abs(shares - rays * weights).sum() <= 3

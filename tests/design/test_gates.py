@@ -37,14 +37,9 @@ def test_a_gate_that_keeps_its_bounds_stays_as_it_is():
 
 @given(st.floats(0.1, 1.0), st.floats(0, 0.5), st.floats(0.05, 0.6), st.floats(0, 0.3), st.floats(0, 0.6))
 def test_any_gate_is_moved_inside_its_bounds(start, width, start_high, width_low, width_more):
-    bounds = replace(
-        Bounds.unbounded(1, LEVEL_FACTOR),
-        start_low=np.array([0.05]),
-        start_high=np.array([start_high]),
-        end_high=np.array([1.5]),
-        width_low=np.array([width_low]),
-        width_high=np.array([width_low + width_more + 1e-3]),
-    )
+    limits = {"start_low": 0.05, "start_high": start_high, "end_high": 1.5, "width_low": width_low}
+    limits["width_high"] = width_low + width_more + 1e-3
+    bounds = replace(Bounds.unbounded(1, LEVEL_FACTOR), **{name: np.array([value]) for name, value in limits.items()})
     ((begin, end),) = admitted_gates(np.array([[start, start + width]]), bounds)
     assert 0.05 - 1e-9 <= begin <= start_high + 1e-9
     assert end <= 1.5 + 1e-9

@@ -2,51 +2,27 @@
 
 from __future__ import annotations
 
-import itertools
 import math
-import os
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from support.command_line import make_run
+from scipy.spatial.transform import Rotation
+from support.rigs import rig
 
 from lidardesign.constraints.document import Constraints
-from lidardesign.errors import DataError, LidardesignError
+from lidardesign.errors import DataError
 from lidardesign.formats.designs import load_design
 from lidardesign.formats.registry import EXPORTERS
 from lidardesign.formats.rig import aim_of, rig_constraints
-from lidardesign.run.xml import _Builder
-from lidardesign.scenes.rays import Rays, rotation_of_quaternion, rotation_of_rpy
+from lidardesign.scenes.rays import rotation_of_quaternion, rotation_of_rpy
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import save_design
-from lidardesign.sensors.pattern import Pattern
 from lidardesign.sensors.sensor import Sensor, boresight_frame, tangent_coordinates
 from lidardesign.space import DesignSpace, angles, direction
 
-NASTY = ('front "left"', "a,b\u00e9</script>", "{x} [bold]")
 EXACT = 1e-12
-
-
-def rig(seed=0, counts=(7, 1, 4), names=NASTY):
-    """A design of explicit rays that start where they like, in an order that mixes its sensors."""
-    generator = np.random.default_rng(seed)
-    total = sum(counts)
-    sensor = generator.permutation(np.repeat(np.arange(len(counts)), counts))
-    origins = generator.normal(size=(len(counts), 3))
-    start = generator.uniform(0, 1, total)
-    table = Rays.from_angles(
-        origins[sensor],
-        generator.uniform(0, 2 * math.pi, total),
-        generator.uniform(-1.5, 1.5, total),
-        np.stack([start, start + generator.uniform(0.01, 2, total)], axis=1),
-        sensor,
-    )
-    sensors = tuple(
-        Sensor(name, n / total, origin, 0.0, 0.0, 0.0, (0.4, 0.4), (0.6, 1.4))
-        for name, n, origin in zip(names, counts, origins, strict=True)
-    )
-    return DesignSpec("rig", sensors, "fixed", (Pattern.of(table),))
 
 
 def counted(design):
@@ -63,25 +39,21 @@ def assert_same_rays(found, expected, tolerance=EXACT):
 
 @pytest.mark.parametrize("name", ["csv", "npz", "mjcf"])
 def test_an_exported_rig_comes_back_ray_by_ray(tmp_path, name):
-    design = rig()
-    rays = design.rays()
+    design, _ = rig()
+    expected = design.rays()
     path = tmp_path / f"rig{EXPORTERS[name].suffix}"
-    EXPORTERS[name].write(design, rays, path)
+    EXPORTERS[name].write(design, expected, path)
     found = load_design(path)
-    # the exchange format of MuJoCo lists sensors in the order in which they first fire
-    order = {one: index for index, one in enumerate(dict.fromkeys(rays.sensor.tolist()))}
-    again = found.rays()
-    expected = rays
-    if name == "mjcf":
-        kept = np.array([order[index] for index in rays.sensor.tolist()])
-        expected = type(rays)(rays.origin_m, rays.direction, rays.gate_m, kept, rays.time_s)
-    assert_same_rays(again, expected)
+    if name == "mjcf":  # lists sensors in the order in which they first fire
+        order = {one: index for index, one in enumerate(dict.fromkeys(expected.sensor.tolist()))}
+        expected = replace(expected, sensor=np.array([order[index] for index in expected.sensor.tolist()]))
+    assert_same_rays(found.rays(), expected)
     assert found.provenance["notes"] == []
     if name == "npz":
-        assert [sensor.name for sensor in found.sensors] == list(NASTY)
+        assert [sensor.name for sensor in found.sensors] == [sensor.name for sensor in design.sensors]
     # and as a design file of ours
     save_design(found, tmp_path / "kept.yaml")
-    assert_same_rays(load_design(tmp_path / "kept.yaml").rays(), again, 0)
+    assert_same_rays(load_design(tmp_path / "kept.yaml").rays(), found.rays(), 0)
 
 
 def test_a_sensor_looks_along_the_middle_of_its_rays_and_holds_them_all():
@@ -261,7 +233,7 @@ def random_model(seed):
     return root
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_rangefinders_look_from_where_mujoco_says_they_are(tmp_path, seed):
     import mujoco
 
@@ -322,7 +294,6 @@ def test_a_model_may_include_files_of_its_own_folder_alone(tmp_path):
 DOCTYPE = '<!DOCTYPE m [<!ENTITY a "aaaaaaaaaa"><!ENTITY b SYSTEM "file:///etc/passwd">]>'
 BAD_XML = {
     "a document type": (DOCTYPE + model_of('<rangefinder site="a" cutoff="1"/>'), "document type"),
-    "cut short": (model_of("")[:-9], "ends early"),
     "no rangefinder": (model_of(""), "has no rangefinder"),
     "an unknown site": (model_of('<rangefinder site="b" cutoff="1"/>'), "MuJoCo cannot read it"),
     "a camera": (model_of('<rangefinder camera="c"/>', '<camera name="c"/>'), "on a camera"),
@@ -330,12 +301,11 @@ BAD_XML = {
         model_of("", '<replicate count="999"><replicate count="99"><site/></replicate></replicate>'),
         "replicates too much",
     ),
-    "too many sites": (model_of("", "<site/>" * 120_001), "too many bodies, sites and sensors"),
+    "too many sites": (model_of("", "<site/>" * 21), "too many bodies, sites and sensors"),
     "no number of copies": (model_of("", '<replicate count="many"><site/></replicate>'), "count is 'many'"),
     "another model": (model_of("", '<attach model="x"/>'), "attaches another model"),
     "no end": (model_of('<rangefinder site="a"/>'), "does not say how far 1 of its 1 rays reach"),
     "a URDF": ("<robot name='r'/>", "root element is '<robot>'"),
-    "a page": ("<html></html>", "root element is '<html>'"),
     "nesting": ("<mujoco>" + "<body>" * 300 + "</body>" * 300 + "</mujoco>", "nested too deep"),
     "no lidar": ("<sdf><model name='m'><link name='l'/></model></sdf>", "has no lidar"),
     "an included model": ("<sdf><world><include><uri>x</uri></include></world></sdf>", "includes are not read"),
@@ -343,7 +313,8 @@ BAD_XML = {
 
 
 @pytest.mark.parametrize("case", BAD_XML)
-def test_xml_that_cannot_be_used_is_refused_by_what_is_wrong(tmp_path, case):
+def test_xml_that_cannot_be_used_is_refused_by_what_is_wrong(tmp_path, monkeypatch, case):
+    monkeypatch.setattr("lidardesign.formats.mjcf.MOST_KEPT", 20)
     content, message = BAD_XML[case]
     path = tmp_path / "m.xml"
     path.write_text(content)
@@ -351,16 +322,6 @@ def test_xml_that_cannot_be_used_is_refused_by_what_is_wrong(tmp_path, case):
         load_design(path)
     assert message in refused.value.message
     assert refused.value.where.startswith(str(path))
-
-
-def test_text_of_many_lines_is_read_in_a_time_that_grows_with_it(tmp_path):
-    """Of a text whose lines are joined one by one, the last line would copy all those before it."""
-    builder, pieces = _Builder(tmp_path / "m.xml"), []
-    take = builder._parser.CharacterDataHandler
-    builder._parser.CharacterDataHandler = lambda text: (pieces.append(text), take(text))
-    lines = "a line<!-- and a remark -->\n" * 20_000
-    assert builder.build(f"<sdf>{lines}</sdf>".encode()).text == "a line\n" * 20_000
-    assert len(pieces) < 10
 
 
 def test_includes_do_not_nest_deeper_than_one_file_may(tmp_path):
@@ -460,11 +421,10 @@ def test_poses_multiply_along_links_frames_joints_and_nested_models(tmp_path, se
 
 def test_degrees_and_quaternions_are_the_same_poses(tmp_path):
     turn = np.array([20.0, -30.0, 100.0])
-    rotation = rotation_of_rpy(*np.radians(turn))
-    w = math.sqrt(1 + np.trace(rotation)) / 2
-    axis = np.array([rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]])
-    x, y, z = (axis / (4 * w)).tolist()
-    np.testing.assert_allclose(rotation_of_quaternion(3 * w, 3 * x, 3 * y, 3 * z), rotation, atol=EXACT)
+    x, y, z, w = Rotation.from_euler("xyz", turn, degrees=True).as_quat().tolist()
+    np.testing.assert_allclose(
+        rotation_of_quaternion(3 * w, 3 * x, 3 * y, 3 * z), rotation_of_rpy(*np.radians(turn)), atol=EXACT
+    )
     forms = [
         f'<pose degrees="true">1 2 3 {turn[0]} {turn[1]} {turn[2]}</pose>',
         f'<pose rotation_format="quat_xyzw">1 2 3 {x} {y} {z} {w}</pose>',
@@ -512,13 +472,10 @@ def test_more_lidars_than_a_design_has_are_refused_at_the_first_too_many(tmp_pat
 
 
 def test_what_an_sdf_file_says_beyond_a_design_is_told(tmp_path):
-    extra = lidar(columns=(1, -0.5, 0.5), rows=None, reach="<max>inf</max>").replace(
-        "<range>", "<noise><type>gaussian</type></noise><range>"
-    )
-    two = lidar(name="eye", rows=(2, 0, 0.1)).replace(
-        "<samples>5", "<samples>5</samples><resolution>2</resolution><!--"
-    )
-    two = two.replace("<!--</samples>", "")
+    noise = "<noise><type>gaussian</type></noise><range>"
+    extra = lidar(columns=(1, -0.5, 0.5), rows=None, reach="<max>inf</max>").replace("<range>", noise)
+    finer = "<samples>5</samples><resolution>2</resolution>"
+    two = lidar(name="eye", rows=(2, 0, 0.1)).replace("<samples>5</samples>", finer)
     text = f'<model name="m"><link name="a">{extra}</link><link name="b">{two}</link></model>'
     design = load_sdf(tmp_path, text, reach_m=3.0)
     notes = "\n".join(design.provenance["notes"])
@@ -530,43 +487,36 @@ def test_what_an_sdf_file_says_beyond_a_design_is_told(tmp_path):
 
 
 CHAIN = "".join(f'<frame name="f{one}" attached_to="f{one + 1}"/>' for one in range(400)) + '<frame name="f400"/>'
+
+
+def posed(pose, more=""):
+    """A model with a lidar that stands by a pose."""
+    return f'<model name="m"><link name="a">{pose}{lidar()}</link>{more}</model>'
+
+
+def beside(frame):
+    return f'<pose relative_to="{frame}">0 0 0 0 0 0</pose>'
+
+
+NAMELESS = f'<world name="w"><model><pose>5 0 0 0 0 0</pose><link name="a">{lidar()}</link></model></world>'
 BAD_SDF = {
-    "a circle": (
-        '<model name="m"><link name="a"><pose relative_to="b">0 0 0 0 0 0</pose>{lidar}</link>'
-        '<frame name="b" attached_to="a"/></model>',
-        "is relative to itself",
-    ),
-    "an unknown frame": (
-        '<model name="m"><link name="a"><pose relative_to="z">0 0 0 0 0 0</pose>{lidar}</link></model>', "'z'",
-    ),
-    "five numbers": ('<model name="m"><link name="a"><pose>0 0 0 0 0</pose>{lidar}</link></model>', "6 finite numbers"),
-    "no quaternion": (
-        '<model name="m"><link name="a"><pose rotation_format="quat_xyzw">0 0 0 0 0 0 0</pose>{lidar}</link></model>',
-        "no length",
-    ),
-    "a link without a name": ('<model name="m"><link>{lidar}</link></model>', "no name"),
-    "a model without a name": (
-        '<world name="w"><model><pose>5 0 0 0 0 0</pose><link name="a">{lidar}</link></model></world>', "no name",
-    ),
-    "two links of one name": (
-        '<model name="m"><link name="a">{lidar}</link><link name="a"><pose>1 0 0 0 0 0</pose>{lidar}</link></model>',
-        "a second link is called 'a'",
-    ),
-    "the world inside a model": (
-        '<model name="m"><link name="a"><pose relative_to="world">0 0 0 0 0 0</pose>{lidar}</link></model>', "'world'",
-    ),
-    "a chain of frames": (
-        f'<model name="m">{CHAIN}<link name="a"><pose relative_to="f0">0 0 0 0 0 0</pose>{{lidar}}</link></model>',
-        "too many others",
-    ),
-}  # fmt: skip
+    "a circle": (posed(beside("b"), '<frame name="b" attached_to="a"/>'), "is relative to itself"),
+    "an unknown frame": (posed(beside("z")), "'z'"),
+    "five numbers": (posed("<pose>0 0 0 0 0</pose>"), "6 finite numbers"),
+    "no quaternion": (posed('<pose rotation_format="quat_xyzw">0 0 0 0 0 0 0</pose>'), "no length"),
+    "a link without a name": (f'<model name="m"><link>{lidar()}</link></model>', "no name"),
+    "a model without a name": (NAMELESS, "no name"),
+    "two links of one name": (posed("", f'<link name="a">{lidar()}</link>'), "a second link is called 'a'"),
+    "the world inside a model": (posed(beside("world")), "'world'"),
+    "a chain of frames": (posed(beside("f0"), CHAIN), "too many others"),
+}
 
 
 @pytest.mark.parametrize("case", BAD_SDF)
 def test_poses_that_cannot_be_found_are_refused_with_their_line(tmp_path, case):
     text, message = BAD_SDF[case]
     with pytest.raises(DataError) as refused:
-        load_sdf(tmp_path, text.replace("{lidar}", lidar()))
+        load_sdf(tmp_path, text)
     assert message in str(refused.value)
     assert refused.value.where == f"{tmp_path / 'robot.sdf'}:3"
 
@@ -585,53 +535,7 @@ def test_a_scan_that_cannot_be_is_refused(tmp_path, options):
         load_sdf(tmp_path, f'<model name="m"><link name="l">{lidar(**options)}</link></model>')
 
 
-# ------------------------------------------------------------------- garbage
-
-
-@pytest.fixture(scope="module")
-def originals(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("originals")
-    design = rig()
-    for name in ("csv", "npz", "mjcf", "sdf"):
-        EXPORTERS[name].write(design, design.rays(), folder / f"rig{EXPORTERS[name].suffix}")
-    return sorted(folder.iterdir())
-
-
-def test_damaged_files_are_read_or_refused_and_nothing_else(tmp_path, originals):
-    generator = np.random.default_rng(11)
-    outcomes = []
-    for number in range(240):
-        source = originals[number % len(originals)]
-        content = bytearray(source.read_bytes())
-        for _ in range(int(generator.integers(1, 4))):
-            place = int(generator.integers(len(content)))
-            choice = generator.integers(3)
-            if choice == 0:
-                content[place] = int(generator.integers(256))
-            elif choice == 1:
-                del content[place : place + int(generator.integers(1, 40))]
-            else:
-                content[place:place] = content[int(generator.integers(len(content))) :][:30]
-        path = tmp_path / source.name
-        path.write_bytes(bytes(content))
-        try:
-            rays = load_design(path, reach_m=2.0).rays()
-        except LidardesignError as error:
-            outcomes.append(error.exit_code)
-        else:
-            assert np.isfinite(rays.direction).all()
-            outcomes.append(0)
-    assert set(outcomes) <= {0, 2, 3}
-    assert outcomes.count(0) > 5
-    assert outcomes.count(3) > 50
-
-
 # ------------------------------------------------------------------- commands
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    return make_run(tmp_path_factory.mktemp("runs") / "flat", count=2000)
 
 
 def flat_rig(tmp_path, count=16, end=True):
@@ -649,24 +553,17 @@ def flat_rig(tmp_path, count=16, end=True):
     return write_rays(tmp_path / "fans.csv", {**columns, "gate_end_m": np.full(count, 0.9)} if end else columns)
 
 
-def test_a_rig_scores_as_the_design_that_fires_its_rays(call, run, tmp_path):
+def test_a_rig_scores_as_the_design_that_fires_its_rays(call, flat, tmp_path):
     path = flat_rig(tmp_path, end=False)
     save_design(load_design(path, reach_m=1.2), tmp_path / "same.yaml")
     for asked, count in (((), 16), (("--rays", 8), 8)):
-        result = call("evaluate", path, "same.yaml", "--in", run, *asked, "--json")
+        result = call("evaluate", path, "same.yaml", "--in", flat, *asked, "--baseline", "none", "--json")
         assert result.code == 0, result.err
         values = {row["design"]: row["value"] for row in result.json["rows"]}
         assert values["fans"] == values["same"]
         assert {row["rays"] for row in result.json["rows"]} == {count}
         assert "the file does not say how far 16 of 16 rays reach; set to 1.2 m" in result.err
         assert any("subset" in note for note in result.json["notes"]) == bool(asked)
-
-
-def test_what_is_no_file_is_refused_before_it_is_waited_for(tmp_path):
-    os.mkfifo(tmp_path / "pipe")
-    for path in (type(tmp_path)("/dev/zero"), tmp_path / "pipe"):
-        with pytest.raises(DataError, match="not a regular file"):
-            load_design(path)
 
 
 @pytest.mark.parametrize("name", ["sensors-csv", "stl"])
@@ -677,30 +574,10 @@ def test_formats_of_sensors_take_no_number_of_rays(call, tmp_path, name):
     assert not (tmp_path / "sensors").exists()
 
 
-def test_fits_like_a_rig_are_no_more_than_it(call, run, tmp_path):
-    path = flat_rig(tmp_path)
-    like = load_design(path)
-    result = call("fit", run, "--like", path, "--name", "alike", "--json")
-    assert result.code == 0, result.err
-    assert result.json["satisfied"]
-    found = load_design(run / "designs" / "alike.yaml")
-    assert found.count == 16
-    for one, theirs in itertools.zip_longest(found.sensors, like.sensors):
-        np.testing.assert_allclose(one.origin_m, theirs.origin_m)
-        assert np.all(np.array(one.field_of_view_rad) <= np.array(theirs.field_of_view_rad) + 1e-6)
-        assert one.gate_m[1] - one.gate_m[0] <= 0.8 + 1e-9
-    assert "like fans: 2 sensors, 16 rays" in result.err
-
-
 def test_sensors_like_a_planar_scanner_stay_planar():
     """A field of view of no height is one: only a single ray has none that could be a bound."""
-    fields = {
-        "fan": (1.0, 0.0),
-        "wall": (0.0, 0.5),
-        "turn": (2 * math.pi, 0.0),
-        "ball": (2 * math.pi, 7.0),
-        "ray": (0, 0),
-    }
+    turn = 2 * math.pi
+    fields = {"fan": (1.0, 0.0), "wall": (0.0, 0.5), "turn": (turn, 0.0), "ball": (turn, 7.0), "ray": (0, 0)}
     sensors = tuple(Sensor(name, 0.2, np.zeros(3), 0.0, 0.0, 0.0, field, (0.6, 1.4)) for name, field in fields.items())
     space = DesignSpace((0,) * 3 + (0, -1.5, 0), (0,) * 3 + (6, 1.5, 9))
     found = rig_constraints(DesignSpec("rig", sensors), space, Constraints(), rays=None).as_document()["each"]
@@ -714,16 +591,16 @@ def test_sensors_like_a_planar_scanner_stay_planar():
     ]
 
 
-def test_what_a_user_asks_for_goes_before_what_the_rig_has(call, run, tmp_path):
+def test_what_a_user_asks_for_goes_before_what_the_rig_has(call, flat, tmp_path):
     path = flat_rig(tmp_path)
     asked = ["--set", "gate.width_m.max=0.3", "--set", "origin.low_m=[0.4,0,0]", "--set", "origin.high_m=[0.6,0,0]"]
-    result = call("constrain", run, "--like", path, *asked, "--rays", "24", "--name", "mine", "--json")
+    result = call("constrain", flat, "--like", path, *asked, "--rays", "24", "--name", "mine", "--json")
     assert result.code == 0, result.err
-    found = load_design(run / "designs" / "mine.yaml")
+    found = load_design(flat / "designs" / "mine.yaml")
     assert found.count == 24
     for sensor in found.sensors:
         assert 0.4 <= sensor.origin_m[0] <= 0.6
         assert sensor.gate_m[1] - sensor.gate_m[0] <= 0.3 + 1e-9
-    refused = call("constrain", run, "--like", path, "--sensors", "3")
+    refused = call("constrain", flat, "--like", path, "--sensors", "3")
     assert refused.code == 4
     assert "--sensors" in refused.err

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.command_line import make_run
 from support.designs import SPACE, drawn_from, three_sensors
+from support.fits import fitted
 
-from lidardesign.constraints.document import Constraints
-from lidardesign.errors import InfeasibleError
 from lidardesign.formats.designs import load_design
-from lidardesign.mixture.fit import FitProblem, fit_sensors
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.sensor import interval_factor
 
@@ -25,16 +21,8 @@ SAMPLES = replace(
 )
 
 
-def fitted(level, **rules):
-    problem = FitProblem(
-        samples=SAMPLES, constraints=Constraints.from_mapping(rules), sensors=3, level=level, em_samples=4000,
-        restarts=2,
-    )  # fmt: skip
-    return fit_sensors(problem).sensors
-
-
 def test_fields_and_gates_hold_as_many_standard_deviations_as_the_level_says():
-    found = [fitted(level) for level in LEVELS]
+    found = [fitted(SAMPLES, sensors=3, level=level, em_samples=4000).sensors for level in LEVELS]
     for level, sensors in zip(LEVELS, found, strict=True):
         factor = interval_factor(level) / interval_factor(LEVELS[0])
         for one, narrow in zip(sensors, found[0], strict=True):
@@ -43,39 +31,29 @@ def test_fields_and_gates_hold_as_many_standard_deviations_as_the_level_says():
             assert np.mean(one.gate_m) == pytest.approx(np.mean(narrow.gate_m))
 
 
-@pytest.mark.parametrize("level", LEVELS)
-def test_a_level_and_a_bound_on_gates_hold_together_or_are_refused_by_the_bound(level):
-    assert all(np.ptp(one.gate_m) <= 0.05 + 1e-9 for one in fitted(level, gate={"width_m": {"max": 0.05}}))
-    with pytest.raises(InfeasibleError):
-        fitted(level, gate={"width_m": {"min": 0.5, "max": 0.4}})
-
-
 def gates_in(path):
     design = load_design(path)
     gates = [sensor.gate_m for sensor in design.sensors]
     return design.level, np.diff(np.asarray(gates), axis=1).mean()
 
 
-def test_fit_and_constrain_take_the_level_and_a_design_that_is_constrained_keeps_it(lidardesign, tmp_path):
-    run = make_run(tmp_path / "run")
-    found = {}
-    for command in ("fit", "constrain"):
-        for level in (0.7, 0.97):
-            options = ("--layout", "even", "--rays", 12, "--sensors", 1, "--level", level)
-            result = lidardesign(command, run, *options, "--json")
-            assert result.code == 0, result.err
-            found[command, level] = gates_in(json.loads(result.out)["design"])
-            assert found[command, level][0] == level
-        assert found[command, 0.7][1] < found[command, 0.97][1]
-    assert found["fit", 0.7] == found["constrain", 0.7]
-    kept = lidardesign("constrain", run / "designs" / "fit.yaml", "--json")
-    assert kept.code == 0, kept.err
-    assert gates_in(json.loads(kept.out)["design"])[0] == 0.97
+def test_fit_and_constrain_take_the_level_and_a_design_that_is_constrained_keeps_it(lidardesign, flat):
+    found = []
+    for command, level in (("fit", 0.7), ("constrain", 0.7), ("fit", 0.97)):
+        options = ("--layout", "even", "--rays", 12, "--sensors", 1, "--level", level)
+        result = lidardesign(command, flat, *options, "--json")
+        assert result.code == 0, result.err
+        found.append(gates_in(result.json["design"]))
+        assert found[-1][0] == level
+    assert found[0] == found[1]
+    assert found[0][1] < found[2][1]
+    kept = lidardesign("constrain", flat / "designs" / "fit.yaml", "--json")
+    assert gates_in(kept.json["design"])[0] == 0.97
 
 
 @pytest.mark.parametrize("level", ["0", "1", "nan", "0.9999999"])
 @pytest.mark.parametrize("command", ["fit", "constrain"])
-def test_a_level_that_holds_nothing_or_everything_is_refused(lidardesign, tmp_path, command, level):
-    result = lidardesign(command, make_run(tmp_path / "run", count=1000), "--level", level)
+def test_a_level_that_holds_nothing_or_everything_is_refused(lidardesign, made, command, level):
+    result = lidardesign(command, made, "--level", level)
     assert result.code == 2
     assert "--level" in result.err

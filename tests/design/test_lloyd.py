@@ -29,13 +29,11 @@ def test_in_the_end_the_cell_of_every_point_is_that_of_the_nearest_mean(count, d
     assert (labels == squared.argmin(axis=1)).all()
 
 
+place = st.tuples(st.integers(0, 5), st.integers(0, 5))
+
+
 @settings(max_examples=60, deadline=None)
-@given(
-    points=st.lists(st.tuples(st.integers(0, 5), st.integers(0, 5)), min_size=1, max_size=60),
-    count=st.integers(1, 12),
-    iterations=st.integers(0, 30),
-    seed=st.integers(0, 9),
-)
+@given(st.lists(place, min_size=1, max_size=60), st.integers(1, 12), st.integers(0, 30), st.integers(0, 9))
 def test_no_cell_is_empty_while_there_are_enough_distinct_points(points, count, iterations, seed):
     features = np.array(points, dtype=float)
     generator = np.random.default_rng(seed)

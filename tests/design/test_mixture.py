@@ -22,50 +22,11 @@ from lidardesign.mixture.components import (
     mean_directions,
     responsibilities,
 )
-from lidardesign.mixture.em import fit_mixture, mixture_of_labels, run_em, seed_mixture
+from lidardesign.mixture.em import fit_mixture, run_em, seed_mixture
 from lidardesign.mixture.m_step import fit_field, fit_gate, maximise
 from lidardesign.numerics import logsumexp, wrap_angle
 from lidardesign.sensors.sensor import boresight_frame, tangent_coordinates, tangent_directions
 from lidardesign.space import DesignSpace, angles
-
-
-def test_a_component_integrates_to_one_over_sphere_and_range():
-    generator = np.random.default_rng(2)
-    count = 400_000
-    mixture = random_mixture(generator, 3, width=0.5)
-    axes_points = np.zeros((count, 6))
-    axes_points[:, 3] = generator.uniform(0, 2 * np.pi, count)
-    axes_points[:, 4] = np.arcsin(generator.uniform(-1, 1, count))
-    axes_points[:, 5] = generator.uniform(0, 9, count)
-    values = np.exp(log_density(mixture, features_of(axes_points, POINT))) * 4 * np.pi * 9
-    error = values.std() / math.sqrt(count)
-    assert abs(values.mean() - 1) < 5 * error
-    assert error < 0.05
-
-
-def test_the_density_does_not_change_when_the_world_turns_about_z():
-    generator = np.random.default_rng(3)
-    mixture = random_mixture(generator, 4)
-    points = drawn(mixture, 200, generator)
-    turn = 2.5
-    rotation = np.array([[math.cos(turn), -math.sin(turn), 0], [math.sin(turn), math.cos(turn), 0], [0, 0, 1]])
-    turned_points = points.copy()
-    turned_points[:, :3] = points[:, :3] @ rotation.T
-    turned_points[:, 3] = (points[:, 3] + turn) % (2 * np.pi)
-    turned = Mixture(
-        mixture.weights,
-        mixture.origin_m @ rotation.T,
-        rotation @ mixture.origin_covariance_m2 @ rotation.T,
-        mixture.azimuth_rad + turn,
-        mixture.elevation_rad,
-        mixture.roll_rad,
-        mixture.spread_rad,
-        mixture.range_m,
-        mixture.spread_range_m,
-    )
-    one = log_density(mixture, features_of(points))
-    other = log_density(turned, features_of(turned_points))
-    np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("turn", [0.3, 1.7, 3.1, 5.9])
@@ -78,25 +39,13 @@ def test_fits_turn_with_the_world_also_across_azimuth_zero(turn):
         azimuth, elevation = angles(looking)
         points = np.zeros((3000, 6))
         points[:, 3], points[:, 4] = np.mod(azimuth + by, 2 * np.pi), elevation
-        points[:, 5] = 3 + 0.1 * generator.standard_normal(3000) * 0 + 0.1 * tangent[:, 0]
+        points[:, 5] = 3 + 0.1 * tangent[:, 0]
         fits.append(fit_mixture(features_of(points, POINT), Bounds.unbounded(1, Z), np.random.default_rng(0)))
     one, other = fits
     assert other.log_likelihood == pytest.approx(one.log_likelihood, abs=1e-6)
-    assert float(wrap_angle(other.mixture.azimuth_rad[0] - one.mixture.azimuth_rad[0] - turn)) == pytest.approx(
-        0, abs=1e-6
-    )
+    turned = other.mixture.azimuth_rad - one.mixture.azimuth_rad
+    np.testing.assert_allclose(wrap_angle(turned - turn), 0, atol=1e-6)
     np.testing.assert_allclose(other.mixture.spread_rad, one.mixture.spread_rad, rtol=1e-6)
-
-
-def test_a_ceiling_sensor_is_fitted_straight_down():
-    generator = np.random.default_rng(5)
-    frame = boresight_frame(0.0, -math.pi / 2)
-    azimuth, elevation = angles(tangent_directions(frame, np.array([0.3, 0.1]) * generator.standard_normal((4000, 2))))
-    points = np.zeros((4000, 6))
-    points[:, 3], points[:, 4], points[:, 5] = azimuth, elevation, 2 + 0.1 * generator.standard_normal(4000)
-    trace = fit_mixture(features_of(points, POINT), Bounds.unbounded(1, Z), np.random.default_rng(0))
-    assert trace.mixture.elevation_rad[0] < -math.pi / 2 + 0.02
-    np.testing.assert_allclose(sorted(trace.mixture.spread_rad[0]), [0.1, 0.3], rtol=0.05)
 
 
 def test_frames_of_many_boresights_are_those_of_each():
@@ -113,32 +62,6 @@ def test_the_angle_ratio_is_accurate_from_zero_to_the_antipode():
     exact = np.array([1.0, *(angle[1:] / np.sin(angle[1:]))])
     np.testing.assert_allclose(ratio, exact, rtol=1e-10)
     assert np.isfinite(angle_ratio(np.array([-1.0, 1.0]), np.empty(2), np.empty(2))).all()
-
-
-def test_statistics_equal_their_definition():
-    generator = np.random.default_rng(8)
-    mixture = random_mixture(generator, 3)
-    points = drawn(mixture, 300, generator)
-    features = features_of(points, weights=generator.uniform(0.1, 1, 300))
-    found = expect(mixture, features)
-    shares = responsibilities(mixture, features) * features.weights[:, None]
-    np.testing.assert_allclose(found.mass, shares.sum(axis=0), rtol=1e-10)
-    np.testing.assert_allclose(found.phi, shares.T @ features.phi.T, rtol=1e-9, atol=1e-12)
-    for k in range(3):
-        u = tangent_coordinates(mixture.frames[k], features.directions.T)
-        np.testing.assert_allclose(found.tangent[k, :, 0], shares[:, k] @ u, rtol=1e-8, atol=1e-12)
-        moment = np.einsum("n,ni,nj->ij", shares[:, k], u, u)
-        np.testing.assert_allclose(found.tangent[k, :, 1:], moment, rtol=1e-8, atol=1e-12)
-    assert found.log_likelihood == pytest.approx(features.weights @ log_density(mixture, features), rel=1e-12)
-
-
-def test_hard_statistics_equal_soft_ones_of_a_single_component():
-    generator = np.random.default_rng(9)
-    mixture = random_mixture(generator, 1)
-    features = features_of(drawn(mixture, 200, generator))
-    soft, hard = expect(mixture, features), label_statistics(mixture, features, np.zeros(200, dtype=int))
-    np.testing.assert_allclose(hard.phi, soft.phi, rtol=1e-10, atol=1e-13)
-    np.testing.assert_allclose(hard.tangent, soft.tangent, rtol=1e-9, atol=1e-13)
 
 
 def test_a_planted_mixture_is_recovered():
@@ -167,89 +90,57 @@ def test_a_planted_mixture_is_recovered():
     np.testing.assert_allclose(found.spread_range_m, plan.spread_range_m, rtol=0.05)
 
 
-def test_one_narrow_component_equals_the_sample_moments_of_scikit_learn():
-    mixture_module = pytest.importorskip("sklearn.mixture")
-    generator = np.random.default_rng(11)
-    points = np.zeros((4000, 6))
-    points[:, 3:] = [1.0, 0.0, 3.0] + np.array([0.004, 0.003, 0.2]) * generator.standard_normal((4000, 3))
-    baseline = mixture_module.GaussianMixture(
-        2, covariance_type="diag", random_state=0, tol=1e-9, max_iter=500, reg_covar=0
-    )
-    baseline.fit(points[:, 3:])
-    start = baseline.predict(points[:, 3:])
-    features = features_of(points, POINT)
-    ours = run_em(
-        mixture_of_labels(features, start, Bounds.unbounded(2, Z)),
-        features,
-        Bounds.unbounded(2, Z),
-        tolerance_nats=1e-10,
-        iterations=2000,
-    )
-    theirs = baseline.score(points[:, 3:])
-    # rolls are one parameter more each, so the fit may only be better
-    assert ours.log_likelihood > theirs - 1e-3
-    assert ours.log_likelihood == pytest.approx(theirs, abs=0.02)
-
-
 bound = st.floats(0.0, 1.0)
 
 
 @st.composite
 def random_bounds(draw, count):
-    base = Bounds.unbounded(count, Z)
-    values = {name: getattr(base, name) for name in base.__dataclass_fields__}
+    base, found = vars(Bounds.unbounded(count, Z)), {}
     if draw(st.booleans()):
-        low = draw(bound) * 2 - 1.5
-        values["origin_low"] = np.full((count, 3), low)
-        values["origin_high"] = np.full((count, 3), low + draw(st.floats(0.05, 2.0)))
+        found["origin_low"] = draw(bound) * 2 - 1.5
+        found["origin_high"] = found["origin_low"] + draw(st.floats(0.05, 2.0))
+    for name in ("origin_spread", "origin_thickness"):
+        if draw(st.booleans()):
+            found[name] = draw(st.floats(0.01, 0.5))
     if draw(st.booleans()):
-        values["origin_spread"] = np.full(count, draw(st.floats(0.01, 0.5)))
-    if draw(st.booleans()):
-        values["azimuth_centre"] = np.full(count, 6 * draw(bound))
-        values["azimuth_half"] = np.full(count, draw(st.floats(0.05, 3.0)))
+        found |= {"azimuth_centre": 6 * draw(bound), "azimuth_half": draw(st.floats(0.05, 3.0))}
     if draw(st.booleans()):
         low = draw(st.floats(-1.5, 1.3))
-        values["elevation_low"] = np.full(count, low)
-        values["elevation_high"] = np.full(count, min(low + draw(st.floats(0.01, 1.0)), 1.57))
+        found |= {"elevation_low": low, "elevation_high": min(low + draw(st.floats(0.01, 1.0)), 1.57)}
     if draw(st.booleans()):
-        low = np.full((count, 2), [0.1 * draw(bound), 0.1 * draw(bound)])
-        widths = [draw(st.floats(0.01, 0.3)), draw(st.floats(0.01, 0.3))]
-        values["spread_low"], values["spread_high"] = low, low + np.array(widths)
+        low, width = (0.1 * np.array([draw(bound), draw(bound)]) for _ in range(2))
+        found |= {"spread_low": low, "spread_high": low + 0.01 + 3 * width}
     if draw(st.booleans()):
         low = draw(st.floats(-math.pi / 4, math.pi / 4))
-        values["roll_low"] = np.full(count, low)
-        values["roll_high"] = np.full(count, draw(st.floats(low, math.pi / 4)))
+        found |= {"roll_low": low, "roll_high": draw(st.floats(low, math.pi / 4))}
     if draw(st.booleans()):
         start, width = 5 * draw(bound), draw(st.floats(0.1, 3.0))
-        values["start_low"] = np.full(count, start)
-        values["end_high"] = np.full(count, start + width)
+        found |= {"start_low": start, "end_high": start + width}
         if draw(st.booleans()):
-            values["width_high"] = np.full(count, width * draw(st.floats(0.1, 1.0)))
+            found["width_high"] = width * draw(st.floats(0.1, 1.0))
         if draw(st.booleans()):
-            values["end_low"] = np.full(count, start + width * draw(st.floats(0.0, 0.9)))
-    return Bounds(**values)
+            found["end_low"] = start + width * draw(st.floats(0.0, 0.9))
+    return Bounds(**{**base, **{name: np.full(base[name].shape, value) for name, value in found.items()}})
 
 
 def assert_keeps(mixture, bounds):
-    tiny = 1e-9
-    assert (mixture.origin_m >= bounds.origin_low - tiny).all()
-    assert (mixture.origin_m <= bounds.origin_high + tiny).all()
-    largest = np.linalg.eigvalsh(mixture.origin_covariance_m2)[:, -1]
-    assert (np.sqrt(largest) <= bounds.origin_spread * (1 + tiny)).all()
-    assert (np.abs(wrap_angle(mixture.azimuth_rad - bounds.azimuth_centre)) <= bounds.azimuth_half + tiny).all()
-    assert (mixture.elevation_rad >= bounds.elevation_low - tiny).all()
-    assert (mixture.elevation_rad <= bounds.elevation_high + tiny).all()
-    assert (mixture.spread_rad >= bounds.spread_low - tiny).all()
-    assert (mixture.spread_rad <= bounds.spread_high + tiny).all()
+    spreads = np.sqrt(np.linalg.eigvalsh(mixture.origin_covariance_m2))
     start, end = mixture.range_m - Z * mixture.spread_range_m, mixture.range_m + Z * mixture.spread_range_m
-    assert (start >= bounds.start_low - tiny).all()
-    assert (start <= bounds.start_high + tiny).all()
-    assert (end >= bounds.end_low - tiny).all()
-    assert (end <= bounds.end_high + tiny).all()
-    assert (end - start <= bounds.width_high + tiny).all()
-    assert (end - start >= bounds.width_low - tiny).all()
-    assert (mixture.roll_rad >= bounds.roll_low - tiny).all()
-    assert (mixture.roll_rad <= bounds.roll_high + tiny).all()
+    away = np.abs(wrap_angle(mixture.azimuth_rad - bounds.azimuth_centre))
+    for name, low, value, high in (
+        ("origin", bounds.origin_low, mixture.origin_m, bounds.origin_high),
+        ("thickness of origins", 0.0, spreads[:, 0], bounds.origin_thickness),
+        ("spread of origins", 0.0, spreads[:, -1], bounds.origin_spread),
+        ("azimuth", 0.0, away, bounds.azimuth_half),
+        ("elevation", bounds.elevation_low, mixture.elevation_rad, bounds.elevation_high),
+        ("roll", bounds.roll_low, mixture.roll_rad, bounds.roll_high),
+        ("field", bounds.spread_low, mixture.spread_rad, bounds.spread_high),
+        ("start", bounds.start_low, start, bounds.start_high),
+        ("end", bounds.end_low, end, bounds.end_high),
+        ("width", bounds.width_low, end - start, bounds.width_high),
+    ):
+        assert (value >= low - 1e-9).all(), name
+        assert (value <= high + 1e-9).all(), name
 
 
 @pytest.mark.hard_case("29")
@@ -293,16 +184,17 @@ def test_roll_and_spreads_are_the_best_inside_their_bounds(data, a, b, turn):
     moment = rotation @ np.diag([a * a, b * b]) @ rotation.T
     roll, spread = fit_field(moment[None], np.zeros(1), bounds, 1e-6, True)
 
-    def quality(angle, sigma):
+    def variances(angle):
         axes = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
-        variance = np.diag(axes @ moment @ axes.T)
-        return (-np.log(sigma) - variance / (2 * sigma**2)).sum()
+        return np.diag(axes @ moment @ axes.T)
+
+    def quality(angle, sigma):
+        return (-np.log(sigma) - variances(angle) / (2 * sigma**2)).sum()
 
     found = quality(roll[0], spread[0])
     assert bounds.roll_low[0] <= roll[0] <= bounds.roll_high[0]
     for angle in np.linspace(bounds.roll_low[0], bounds.roll_high[0], 61):
-        axes = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
-        sigma = np.clip(np.sqrt(np.diag(axes @ moment @ axes.T)), bounds.spread_low[0], bounds.spread_high[0])
+        sigma = np.clip(np.sqrt(variances(angle)), bounds.spread_low[0], bounds.spread_high[0])
         assert found >= quality(angle, sigma) - 1e-9
 
 
@@ -334,12 +226,11 @@ FIXED = {
 def test_fixed_dimensions_leave_the_density(name):
     space = DesignSpace(*FIXED[name])
     generator = np.random.default_rng(14)
-    features = features_of(space.sample(800, generator), space)
+    features = features_of(space.sample(400, generator), space)
     trace = fit_mixture(features, Bounds.unbounded(3, Z), generator)
     assert (np.diff(trace.history) >= 0).all()
     # a uniform density over the free dimensions is known, and no fit can be far above it
-    free = [i for i in space.free]
-    volume = np.prod([space.chart_high[i] - space.chart_low[i] for i in free])
+    volume = math.prod(space.chart_high[i] - space.chart_low[i] for i in space.free)
     assert -math.log(volume) - 1.0 < trace.log_likelihood < -math.log(volume) + 0.6
 
 
@@ -380,26 +271,20 @@ def case_of(name, count=70):
 
 
 @pytest.mark.hard_case("30")
-@pytest.mark.parametrize("block", [7, 2048])
+@pytest.mark.parametrize("block", [1, 7, 2048])
 @pytest.mark.parametrize("name", SPACES)
-def test_density_and_shares_are_those_of_the_free_dimensions_alone_in_blocks_of_any_length(name, block, monkeypatch):
+def test_densities_and_sums_over_shares_are_those_of_the_free_dimensions_in_blocks_of_any_length(
+    name, block, monkeypatch
+):
     monkeypatch.setattr("lidardesign.mixture.components.BLOCK", block)
     mixture, features = case_of(name)
     terms = naive_terms(mixture, features)
     whole = logsumexp(terms, axis=1)
+    shares = np.exp(terms - whole[:, None])
     np.testing.assert_allclose(log_density(mixture, features), whole, rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(responsibilities(mixture, features), np.exp(terms - whole[:, None]), atol=1e-9)
-
-
-@pytest.mark.parametrize("block", [1, 7, 70, 1000])
-@pytest.mark.parametrize("name", SPACES)
-def test_statistics_are_sums_over_the_shares_in_blocks_of_any_length(name, block, monkeypatch):
-    monkeypatch.setattr("lidardesign.mixture.components.BLOCK", block)
-    mixture, features = case_of(name)
-    terms = naive_terms(mixture, features)
-    shares = np.exp(terms - logsumexp(terms, axis=1)[:, None]) * features.weights[:, None]
-    found = expect(mixture, features)
-    assert found.log_likelihood == pytest.approx(features.weights @ logsumexp(terms, axis=1), rel=1e-9)
+    np.testing.assert_allclose(responsibilities(mixture, features), shares, atol=1e-9)
+    found, shares = expect(mixture, features), shares * features.weights[:, None]
+    assert found.log_likelihood == pytest.approx(features.weights @ whole, rel=1e-9)
     np.testing.assert_allclose(found.mass, shares.sum(axis=0), rtol=1e-8)
     np.testing.assert_allclose(found.phi, shares.T @ features.phi.T, rtol=1e-7, atol=1e-10)
     np.testing.assert_allclose(found.tangent, tangent_sums(mixture, features, shares), rtol=1e-7, atol=1e-10)
@@ -461,7 +346,3 @@ def test_mixtures_and_their_statistics_are_themselves_alone_and_can_be_keys():
         assert one == one
         assert one != same
         assert len({one, same}) == 2
-    with pytest.raises(AttributeError):
-        mixture.weights = np.ones(3)
-    with pytest.raises(AttributeError):
-        statistics.mass = np.ones(3)

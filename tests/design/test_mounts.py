@@ -82,11 +82,6 @@ def test_the_order_of_the_mounts_does_not_matter():
     assert all(other == first for other in others)
 
 
-def test_sensors_may_have_mounts_of_their_own():
-    sensors = fitted(each=[{"origin": {"mounts_m": MOUNTS[2:]}}, {"origin": {"mounts_m": MOUNTS[:2]}}])
-    assert [list(sensor.origin_m) in MOUNTS[2:] for sensor in sensors] == [True, False]
-
-
 def test_each_sensor_keeps_its_own_gate_at_its_mount():
     gates = [{"gate": {"width_m": {"max": 0.1}}}, {}]
     start, end = fitted(origin={"mounts_m": MOUNTS}, sensors={"count": 2}, each=gates)[0].gate_m

@@ -47,10 +47,6 @@ def reaches_into(low, high, box):
     return all(b < t and h > b and lo < t for lo, h, b, t in zip(low, high, box["low_m"], box["high_m"], strict=True))
 
 
-def corners(free):
-    return {(*low, *high) for low, high in zip(free.low_m.tolist(), free.high_m.tolist(), strict=True)}
-
-
 def meets_space(box):
     """Whether it takes some of the volume of the space."""
     return all(b < t and b < 6 and t > 0 for b, t in zip(box["low_m"], box["high_m"], strict=True))
@@ -97,20 +93,6 @@ def test_a_point_is_inside_a_box_or_in_a_free_one(boxes, point):
     )
 
 
-def test_one_pillar_leaves_its_six_sides():
-    free = free_boxes(one_with([{"low_m": [2, 2, 2], "high_m": [3, 4, 5]}]), SPACE)
-    assert corners(free) == {
-        (0, 0, 0, 2, 6, 6), (3, 0, 0, 6, 6, 6), (0, 0, 0, 6, 2, 6), (0, 4, 0, 6, 6, 6), (0, 0, 0, 6, 6, 2),
-        (0, 0, 5, 6, 6, 6),
-    }  # fmt: skip
-
-
-def test_boxes_beside_the_space_leave_intervals_free_on_its_other_sides():
-    free = free_boxes(one_with([{"low_m": [-3, -1, -1], "high_m": [0, 7, 7]}]), SPACE)
-    inf = math.inf
-    assert (0, -inf, -inf, inf, inf, inf) in corners(free)
-
-
 def test_sides_beyond_the_origin_box_are_left_out():
     pillar = {"low_m": [2, -1, -1], "high_m": [3, 7, 5]}
     assert len(free_boxes(one_with([pillar]), SPACE).low_m) == 3
@@ -127,14 +109,6 @@ def test_a_fixed_coordinate_is_in_a_box_or_not(height, left):
     assert len(free.low_m) == left
     assert np.isinf(free.low_m[:, 2]).all()
     assert len(free_boxes(one_with([pillar], low_m=[0, 0, 0.5], high_m=[6, 6, 0.5]), SPACE).low_m) == 4
-
-
-def test_boxes_that_touch_leave_no_gap():
-    halves = [{"low_m": [-1, -1, -1], "high_m": [3, 7, 7]}, {"low_m": [3, -1, -1], "high_m": [7, 7, 7]}]
-    assert len(free_boxes(one_with(halves), SPACE).low_m) == 0
-    halves[1]["low_m"][0] = 3.001
-    free = free_boxes(one_with(halves), SPACE)
-    assert (free.low_m[0, 0], free.high_m[0, 0]) == (3, 3.001)
 
 
 def test_the_nearest_place_is_in_the_nearest_box():
@@ -277,18 +251,6 @@ def test_the_best_of_the_boxes_is_taken():
     # axes are not independent, so a box may be missed; on average almost nothing is lost
     assert (found - least).mean() < 0.02
     assert np.median(found - least) < 1e-9
-
-
-def test_old_parameters_are_kept_where_nothing_is_better():
-    generator = np.random.default_rng(4)
-    mean, scatter = moments(generator, 50, 3)
-    free = free_boxes(one_with([{"low_m": [-1, -1, -1], "high_m": [1, 1, 1]}]), SPACE)
-    limits = limits_of(*free, 50)
-    point, covariance = best_origins(mean, scatter, limits, np.zeros((50, 3)), np.zeros((50, 3, 3)))
-    for _ in range(6):
-        before = objective(mean, scatter, point, covariance)
-        point, covariance = best_origins(mean, scatter, limits, point, covariance)
-        assert (objective(mean, scatter, point, covariance) <= before).all()
 
 
 @settings(max_examples=20, deadline=None)

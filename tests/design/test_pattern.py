@@ -53,24 +53,9 @@ def test_between_knots_every_number_of_a_ray_is_linear(pattern, share):
     value = between(pattern, share)
     table = columns_of(pattern).reshape(len(pattern.knots), -1)
     naive = np.array([np.interp(value, pattern.knots, column) for column in table.T])
-    np.testing.assert_allclose(columns_at(pattern, value).ravel(), naive, rtol=1e-9, atol=1e-5)
-
-
-@given(moving, shares)
-def test_bounds_that_both_neighbouring_knots_keep_are_kept_between_them(pattern, share):
-    rays = pattern.at(between(pattern, share, last=1))
-    width_m = np.diff(pattern.gate_m, axis=2)[..., 0]
-    found = {
-        "azimuth": (pattern.azimuth_rad, rays.azimuth_rad),
-        "elevation": (pattern.elevation_rad, rays.elevation_rad),
-        "start": (pattern.gate_m[..., 0], rays.gate_m[:, 0]),
-        "end": (pattern.gate_m[..., 1], rays.gate_m[:, 1]),
-        "width": (width_m, np.diff(rays.gate_m, axis=1)[:, 0]),
-    }
-    for name, (knots, here) in found.items():
-        low, high = knots[:2].min(axis=0), knots[:2].max(axis=0)
-        rounding = ROUNDING * max(1.0, np.abs(pattern.gate_m).max())
-        assert ((here >= low - rounding) & (here <= high + rounding)).all(), name
+    # so close that gates keep between knots the bounds that they keep at both
+    rounding = ROUNDING * np.maximum(1.0, np.abs(table).max(axis=0))
+    assert (np.abs(columns_at(pattern, value).ravel() - naive) <= rounding).all()
 
 
 @given(moving, shares)
@@ -193,13 +178,6 @@ def test_moving_changes_the_named_coordinates_of_origins_alone(pattern, values):
     for axis, value in values.items():
         expected[..., axis] = value
     np.testing.assert_array_equal(columns_of(moved), expected)
-
-
-@given(patterns() | moving)
-def test_rays_are_counted_sensor_by_sensor(pattern):
-    counts = pattern.per_sensor(4)
-    assert counts.sum() == len(pattern)
-    assert counts.tolist() == [int((pattern.sensor == index).sum()) for index in range(4)]
 
 
 @given(patterns() | moving)

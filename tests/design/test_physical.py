@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,10 +11,6 @@ from support import references
 from support.designs import from_the_ceiling
 from support.fits import broken, fitted
 
-from lidardesign.mixture.bounds import Bounds
-from lidardesign.mixture.components import Axes, Features
-from lidardesign.mixture.em import mixture_of_labels, run_em
-from lidardesign.numerics import clipped_eigenvalues
 from lidardesign.samples import Samples
 from lidardesign.sensors.pattern import even_rays
 from lidardesign.sensors.sensor import boresight_frame, interval_factor, tangent_directions
@@ -99,31 +94,3 @@ def test_the_thickness_of_a_region_is_bounded_along_its_thinnest_direction_alone
     assert abs(np.linalg.eigh(thin.sensors[0].covariance_m2)[1][:, 0] @ axes[:, 2]) > 0.99
     assert broken(thin, rules, CUBE) == []
     assert broken(free, rules, CUBE) == ["s0.origin.thickness_m.max"]
-
-
-def test_the_log_likelihood_never_falls_with_thin_origins():
-    samples, _ = tilted_sheet()
-    features = Features.of(samples.points, samples.weights, Axes.of(CUBE), CUBE)
-    bounds = replace(Bounds.unbounded(4, interval_factor(0.95)), origin_thickness=np.full(4, 0.02))
-    labels = np.random.default_rng(6).integers(0, 4, len(features))
-    trace = run_em(mixture_of_labels(features, labels, bounds), features, bounds, iterations=40)
-    assert len(trace.history) > 3
-    assert (np.diff(trace.history) >= 0).all()
-    thin = np.sqrt(np.linalg.eigvalsh(trace.mixture.origin_covariance_m2)[:, 0])
-    assert (thin <= 0.02 * (1 + 1e-9)).all()
-
-
-def test_lowering_the_least_eigenvalue_is_the_best_covariance_of_bounded_thickness():
-    generator = np.random.default_rng(7)
-    root = generator.normal(size=(3, 3))
-    scatter = root @ root.T
-    limit = 0.5 * np.linalg.eigvalsh(scatter)[0]
-
-    def likelihood(covariance):
-        return -np.linalg.slogdet(covariance)[1] - np.trace(np.linalg.solve(covariance, scatter))
-
-    best = likelihood(clipped_eigenvalues(scatter, 0.0, np.inf, limit))
-    for _ in range(300):
-        other = generator.normal(size=(3, 3))
-        other = clipped_eigenvalues(other @ other.T + scatter, 1e-3, np.inf, limit)
-        assert likelihood(other) <= best + 1e-9

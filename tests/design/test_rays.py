@@ -187,14 +187,6 @@ def test_a_sample_is_aimed_anew_from_one_place_and_stays_where_it_is_in_a_region
     np.testing.assert_allclose(fired[0, :3], beside[:3])
 
 
-def test_the_share_of_a_sensors_own_samples_inside_is_the_level_to_the_third_power():
-    one = sensor(elevation_rad=0.0, roll_rad=0.0, spread_rad=(0.05, 0.05))
-    generator, count = np.random.default_rng(5), 40_000
-    drawn = generator.normal([1.0, 0.0, 1.0], [0.05, 0.05, 0.1], (count, 3))
-    found, _ = owned((one,), np.column_stack([np.tile(one.origin_m, (count, 1)), drawn]))
-    assert (found == 0).mean() == pytest.approx(0.95**3, abs=0.006)
-
-
 def test_a_fan_without_height_keeps_its_samples():
     fan = replace(sensor(elevation_rad=0.3, roll_rad=0.0), field_of_view_rad=(0.4, 0.0))
     generator = np.random.default_rng(6)

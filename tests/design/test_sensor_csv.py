@@ -41,10 +41,6 @@ def spreads_of(sensor):
     return tuple(angle / (2 * Z) for angle in sensor.field_of_view_rad)
 
 
-def normal_gate(mean, spread):
-    return (max(mean - Z * spread, 0.0), mean + Z * spread)
-
-
 @settings(max_examples=60, deadline=None)
 @given(design=designs())
 def test_sensors_come_back_from_the_table(design, tmp_path_factory):
@@ -67,7 +63,7 @@ def test_an_azimuth_sigma_is_the_angle_that_it_spans_on_the_sphere(tmp_path, ele
     sensor = read_sensor_csv(path).sensors[0]
     beside = tangent_coordinates(sensor.frame, direction(np.array([3.14 + sigma]), np.array([elevation])))
     assert spreads_of(sensor)[0] == pytest.approx(beside[0, 0], rel=1e-6)
-    assert sensor.gate_m == pytest.approx(normal_gate(1.2, 0.3))
+    assert sensor.gate_m == pytest.approx((1.2 - Z * 0.3, 1.2 + Z * 0.3))
 
 
 def test_the_header_the_order_of_named_columns_and_a_byte_order_mark_do_not_matter(tmp_path):
@@ -80,15 +76,6 @@ def test_the_header_the_order_of_named_columns_and_a_byte_order_mark_do_not_matt
     first, second = load_design(plain).sensors[0], load_design(shuffled).sensors[0]
     for field in FIELDS:
         np.testing.assert_array_equal(getattr(first, field), getattr(second, field))
-
-
-def test_azimuths_beyond_a_turn_point_the_same_way(tmp_path):
-    boresights = []
-    for azimuth in (3.5, 3.5 - 2 * math.pi, 3.5 + 2 * math.pi):
-        path = tmp_path / "a.csv"
-        path.write_text(ROW.replace("3.14", repr(azimuth)))
-        boresights.append(load_design(path).sensors[0].boresight)
-    np.testing.assert_allclose(boresights, [boresights[0]] * 3, atol=1e-12)
 
 
 def test_weights_are_normalised_with_a_note(tmp_path):
@@ -113,22 +100,21 @@ def test_the_moving_robots_variant_is_read_at_one_position_and_refused_at_severa
             load_design(path)
 
 
-def test_straight_down_is_written_with_the_azimuth_spread_cut_at_a_turn(tmp_path):
-    sensor = normal_sensor("down", azimuth_rad=0.5, elevation_rad=-math.pi / 2, spread_rad=(0.2, 0.1))
-    notes = write_sensor_csv(DesignSpec("d", (sensor,)), (), tmp_path / "d.csv")
-    assert any("pole" in note for note in notes)
+@pytest.mark.parametrize(
+    ("pose", "word", "spreads"),
+    [
+        # the azimuth's spread is cut at a turn
+        ({"azimuth_rad": 0.5, "elevation_rad": -math.pi / 2}, "pole", (None, 0.1)),
+        ({"roll_rad": math.pi / 2}, "roll", (0.1, 0.2)),
+    ],
+)
+def test_poses_that_the_table_cannot_hold_are_told(tmp_path, pose, word, spreads):
+    sensor = normal_sensor("one", spread_rad=(0.2, 0.1), **pose)
+    assert any(word in note for note in write_sensor_csv(DesignSpec("d", (sensor,)), (), tmp_path / "d.csv"))
     loaded = load_design(tmp_path / "d.csv").sensors[0]
-    assert np.isfinite(loaded.field_of_view_rad[0])
-    assert loaded.field_of_view_rad[1] == pytest.approx(sensor.field_of_view_rad[1])
-    assert loaded.elevation_rad == -math.pi / 2
-
-
-def test_a_quarter_turn_of_roll_swaps_the_spreads_and_is_noted(tmp_path):
-    sensor = normal_sensor("r", roll_rad=math.pi / 2, spread_rad=(0.2, 0.1))
-    notes = write_sensor_csv(DesignSpec("d", (sensor,)), (), tmp_path / "d.csv")
-    assert any("roll" in note for note in notes)
-    loaded = load_design(tmp_path / "d.csv").sensors[0]
-    assert spreads_of(loaded) == pytest.approx((0.1, 0.2))
+    assert loaded.elevation_rad == sensor.elevation_rad
+    for found, spread in zip(spreads_of(loaded), spreads, strict=True):
+        assert np.isfinite(found) if spread is None else found == pytest.approx(spread)
 
 
 @pytest.mark.parametrize(
@@ -140,17 +126,12 @@ def test_a_quarter_turn_of_roll_swaps_the_spreads_and_is_noted(tmp_path):
         (f"{HEADER}\n{ROW}\n{ROW.replace('0.3,1', '-0.3,1')}", ":3:15", "time_sigma"),
         (f"{HEADER}\n{ROW[:-1]}-1", ":2:16", "at least 0"),
         (f"{HEADER}\n{ROW[:-2]}", ":2", "15 columns"),
-        (f"{HEADER}\n{ROW},1,2", ":2", "18 columns"),
         (ROW.replace("0.1,1.2", "1.7,1.2"), ":1", "elevation_mean"),
         (ROW.replace("0.04,0.01", "0.04,0.9"), ":1", "eigenvalue"),
         (ROW[:-1] + "0", "", "sum to 0"),
         (ROW.replace(",0.3,1", ",0,1"), ":1", "no width"),
         (HEADER, "", "no sensor"),
-        (
-            f"{HEADER.replace('weight', 'wieght')}\n{ROW}",
-            ":1",
-            "missing columns: weight; unknown or repeated: wieght",
-        ),
+        (f"{HEADER.replace('weight', 'wieght')}\n{ROW}", ":1", "unknown or repeated: wieght"),
         (f"{HEADER.replace('weight', 'time_sigma')}\n{ROW}", ":1", "missing columns: weight"),
     ],
 )
@@ -162,16 +143,6 @@ def test_a_bad_table_is_refused_with_its_position(tmp_path, text, position, says
     assert f"bad.csv{position}: " in str(caught.value)
     assert says in str(caught.value)
     assert caught.value.exit_code == 3
-
-
-def test_an_empty_file_and_bytes_that_are_no_text_are_refused(tmp_path):
-    path = tmp_path / "bad.csv"
-    path.write_text("\n \n")
-    with pytest.raises(DataError, match="empty"):
-        read_sensor_csv(path)
-    path.write_bytes(b"1,\xff\xfe,3\n")
-    with pytest.raises(DataError, match="UTF-8"):
-        load_design(path)
 
 
 @pytest.mark.parametrize("text", ["schema_version: 2\nsensors: [1, 2]\n", "a: 1, 2", "{a: 1, b: 2}", "[1, 2]", "- 1"])

@@ -8,21 +8,16 @@ import xml.etree.ElementTree as ElementTree
 
 import numpy as np
 import pytest
+from support.rays import rays_along
 from support.rigs import even, farthest_nearest, sensor
 from support.sensors import normal_sensor
 
 from lidardesign.errors import ConfigError
 from lidardesign.formats.registry import EXPORTERS
-from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.design import DesignSpec
 
 ONE = DesignSpec("one", (normal_sensor("one"),))
-
-
-def rays_with_gates(gates_m):
-    """Rays forward from the origin, each with a gate."""
-    count = len(gates_m)
-    return Rays(np.zeros((count, 3)), np.tile([1.0, 0, 0], (count, 1)), gates_m, np.zeros(count), np.zeros(count))
+FORWARD = [1.0, 0.0, 0.0]
 
 
 # HELIOS++ -----------------------------------------------------------------------------------------------------------
@@ -50,12 +45,12 @@ def helios_intensity(beam, power_w, divergence_rad, start_m, range_m, brightness
     return 1e9 * power_w * share * APERTURE_M**2 * EFFICIENCY * air * np.pi / 4 * brightness / range_m**2
 
 
-def helios_range_m(scanner, channel, range_m, version, brightness, start_m=None):
+def helios_range_m(scanner, channel, range_m, version, brightness):
     """The range of a point that HELIOS++ writes for a surface in front of a channel; None: it writes none."""
     beam, least = version
     waveform = scanner.find("FWFSettings")
     pulse, bin_ns = float(scanner.get("pulseLength_ns")), float(waveform.get("binSize_ns"))
-    start = float(channel.get("rangeMin_m")) if start_m is None else start_m
+    start = float(channel.get("rangeMin_m"))
     if range_m < start or range_m > float(channel.get("rangeMax_m")):
         return None
     power_w, divergence_rad = float(scanner.get("averagePower_w")), float(scanner.get("beamDivergence_rad"))
@@ -82,7 +77,7 @@ def helios_range_m(scanner, channel, range_m, version, brightness, start_m=None)
 
 
 def helios_scanner(folder, gates_m):
-    notes = EXPORTERS["helios"].write(ONE, rays_with_gates(gates_m), folder)
+    notes = EXPORTERS["helios"].write(ONE, rays_along(np.tile(FORWARD, (len(gates_m), 1)), gates_m), folder)
     scanner = ElementTree.parse(folder / "scanners.xml").find("scanner")
     return scanner, list(scanner.iter("channel")), notes
 
@@ -103,13 +98,6 @@ def test_helios_returns_what_lies_inside_a_gate_wherever_that_starts(tmp_path, v
         for range_m in (0.9 * start, end + 0.002):
             assert helios_range_m(scanner, channel, range_m, version, 1.0) is None
     assert any("3 of 8 rays start below 0.001 m" in note for note in notes)
-
-
-@pytest.mark.parametrize("version", HELIOS)
-def test_helios_would_send_no_power_through_a_gate_from_0(tmp_path, version):
-    scanner, [channel], _ = helios_scanner(tmp_path / "out", np.array([[0.0, 25]]))
-    found = helios_range_m(scanner, channel, 1.0, version, 1.0, start_m=0.0)
-    assert (found is None) == (version[0] != "Gaussian")
 
 
 # CARLA --------------------------------------------------------------------------------------------------------------
@@ -172,8 +160,7 @@ def test_every_frame_of_carla_has_the_grids_rays_once(tmp_path, rate_hz, case):
     local = even(columns, rows, azimuth, elevation)
     count = len(local)
     looking = sensor("one", (0.3, -0.4, 1.2), 2.5, -0.4, 0.3)
-    places, gates = np.tile(looking.origin_m, (count, 1)), np.tile([0.0, 9.0], (count, 1))
-    rays = Rays(places, local @ looking.frame, gates, np.zeros(count), np.zeros(count))
+    rays = rays_along(local @ looking.frame, (0.0, 9.0), looking.origin_m)
     EXPORTERS["carla"].write(DesignSpec("one", (looking,)), rays, tmp_path / "out.json", rate_hz)
     whole = json.loads((tmp_path / "out.json").read_text())
     [written] = whole["sensors"]
@@ -203,21 +190,20 @@ HARD_TO_SWEEP = [
 def test_carla_sweeps_just_the_whole_field_in_a_frame(tmp_path, rate_hz, field_deg):
     field = np.radians(field_deg)
     local = even(4, 1, (-field / 2, field / 4), (0.0, 0.0))
-    rays = Rays(np.zeros((4, 3)), local, np.tile([0.0, 9.0], (4, 1)), np.zeros(4), np.zeros(4))
+    rays = rays_along(local, (0.0, 9.0))
     EXPORTERS["carla"].write(ONE, rays, tmp_path / "out.json", rate_hz)
     whole = json.loads((tmp_path / "out.json").read_text())
     text = whole["sensors"][0]["attributes"]
     step_s = SINGLE(whole["fixed_delta_seconds"])
-    assert SINGLE(text["rotation_frequency"]) * SINGLE(text["horizontal_fov"]) * step_s == SINGLE(
-        text["horizontal_fov"]
-    )
-    assert float(text["horizontal_fov"]) == pytest.approx(field_deg, rel=5e-4)
+    rate, found = SINGLE(text["rotation_frequency"]), SINGLE(text["horizontal_fov"])
+    assert rate * found * step_s == found
+    assert found == pytest.approx(field_deg, rel=5e-4)
 
 
 @pytest.mark.parametrize("rate_hz", [0.001, 1.0, 2.49, 2001, 1e5])
 def test_carla_refuses_frames_that_unreal_does_not_have(tmp_path, rate_hz):
     with pytest.raises(ConfigError, match=r"--rate-hz[\s\S]*2\.5 to 2000 Hz"):
-        EXPORTERS["carla"].write(ONE, rays_with_gates(np.array([[0.0, 9.0]])), tmp_path / "out.json", rate_hz)
+        EXPORTERS["carla"].write(ONE, rays_along(FORWARD, np.array([[0.0, 9.0]])), tmp_path / "out.json", rate_hz)
 
 
 # Gazebo -------------------------------------------------------------------------------------------------------------
@@ -274,14 +260,7 @@ GAZEBO_GRIDS = {
 def test_gazebos_pixels_are_no_farther_from_the_rays_than_the_note_says(tmp_path, case):
     (columns, rows), azimuth, elevation, side = GAZEBO_GRIDS[case]
     local = even(columns, rows, azimuth, elevation)
-    rays = Rays(
-        np.zeros((len(local), 3)),
-        local,
-        np.tile([0.0, 9.0], (len(local), 1)),
-        np.zeros(len(local)),
-        np.zeros(len(local)),
-    )
-    notes = EXPORTERS["sdf"].write(ONE, rays, tmp_path / "out.sdf")
+    notes = EXPORTERS["sdf"].write(ONE, rays_along(local, (0.0, 9.0)), tmp_path / "out.sdf")
     [sensor] = ElementTree.parse(tmp_path / "out.sdf").iter("sensor")
     read, found_side = gazebo_pixels(sensor.find("lidar/scan"))
     assert found_side == side
@@ -301,7 +280,7 @@ def test_gazebos_pixels_are_no_farther_from_the_rays_than_the_note_says(tmp_path
 @pytest.mark.parametrize("rate_hz", [0.001, 29.97, 1e6])
 def test_rgl_takes_patterns_ranges_and_rates_at_their_ends(tmp_path, rate_hz):
     gates_m = np.array([[0, 0], [0, 1e-9], [0.3, 0.3 + 1e-12], [1e-30, 1e9]])
-    EXPORTERS["rgl"].write(ONE, rays_with_gates(gates_m), tmp_path / "out", rate_hz)
+    EXPORTERS["rgl"].write(ONE, rays_along(np.tile(FORWARD, (len(gates_m), 1)), gates_m), tmp_path / "out", rate_hz)
     plugin = ElementTree.parse(tmp_path / "out" / "model.sdf").find("model/link/sensor/plugin")
     assert {"update_rate", "range", "topic", "frame", "pattern_preset_path"} <= {one.tag for one in plugin}
     whole = np.array([[SINGLE(plugin.findtext(f"range/{name}")) for name in ("min", "max")]])
@@ -323,18 +302,6 @@ def test_rgl_takes_patterns_ranges_and_rates_at_their_ends(tmp_path, rate_hz):
 # libs/qCC_io/src/PlyFilter.cpp; source/blender/io/ply/importer/ply_import_data.cc
 
 
-def properties(path):
-    """Names of each element's properties, by the header."""
-    found = {}
-    for line in path.read_bytes().partition(b"end_header")[0].decode("ascii").splitlines():
-        words = line.split()
-        if words[0] == "element":
-            found[words[1]] = []
-        elif words[0] == "property":
-            found[list(found)[-1]].append(words[-1])
-    return found
-
-
 def cloudcompare(element, names):
     """What CloudCompare takes each property for, before it asks."""
     found = {}
@@ -351,17 +318,13 @@ def cloudcompare(element, names):
     return found
 
 
-@pytest.fixture(scope="module")
-def points(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("ply")
-    EXPORTERS["ply"].write(ONE, rays_with_gates(np.array([[0.0, 9.0]])), folder)
-    return folder
-
-
-def test_cloudcompare_knows_every_property_of_the_points(points):
-    names = properties(points / "rays.ply")["vertex"]
+def test_cloudcompare_knows_every_property_of_the_points(tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    EXPORTERS["ply"].write(ONE, rays_along(FORWARD, (0.0, 9.0)), tmp_path)
+    points, beams = (trimesh.load(tmp_path / f"{name}.ply").metadata["_ply_raw"] for name in ("rays", "beams"))
+    names = list(points["vertex"]["properties"])
     known = cloudcompare("vertex", names)
     assert [known[name.upper()] for name in names] == [
         *("X", "Y", "Z", "NX", "NY", "NZ", "RED", "GREEN", "BLUE"), *("scalar",) * 4
     ]  # fmt: skip
-    assert set(cloudcompare("edge", properties(points / "beams.ply")["edge"]).values()) == {None}
+    assert set(cloudcompare("edge", beams["edge"]["properties"]).values()) == {None}

@@ -6,6 +6,8 @@ from support.rigs import rig
 
 from lidardesign.errors import ConfigError
 from lidardesign.formats.registry import EXPORTERS
+from lidardesign.scenes.rays import rotation_of_quaternion
+from lidardesign.space import direction
 
 DESIGN, RAYS = rig()
 COUNTS = np.bincount(RAYS.sensor)
@@ -37,28 +39,6 @@ def stage(tmp_path_factory):
     path = tmp_path_factory.mktemp("usd") / "rig.usda"
     EXPORTERS["isaac-usd"].write(DESIGN, RAYS, path)
     return usd.Stage.Open(str(path))
-
-
-def world(state, turn):
-    """Unit vectors in the world of emitters by degrees: x forward, y to the left at +90, z up."""
-    azimuth, elevation = (np.radians(np.array(state[key], dtype=np.float64)) for key in ("azimuthDeg", "elevationDeg"))
-    flat = np.cos(elevation)
-    return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=1) @ turn.T
-
-
-def turn_of(w, x, y, z):
-    """A rotation matrix of a unit quaternion, column by column: how it turns each axis."""
-    axis = np.array([x, y, z])
-    return np.stack([one + 2 * np.cross(axis, np.cross(axis, one) + w * one) for one in np.eye(3)], axis=1)
-
-
-def check_emitters(state, ranges, rays, turn):
-    """That emitters are a sensor's rays, one by one."""
-    np.testing.assert_allclose(world(state, turn), rays.direction, atol=2e-7)
-    np.testing.assert_allclose(np.array(ranges)[list(state["rangeId"])], np.maximum(rays.gate_m, 0.001), atol=3e-7)
-    times = np.array(state["fireTimeNs"], dtype=np.int64)
-    assert (np.abs(times - rays.time_s * 1e9) <= 1).all()
-    assert times.max() < 100_000_000
 
 
 def test_usd_has_an_omnilidar_per_sensor_with_the_schemas_types(stage):
@@ -95,10 +75,16 @@ def test_usd_places_every_ray_with_its_gate(stage):
         place = np.array(prim.GetAttribute("xformOp:translate").Get())
         np.testing.assert_allclose(place, mine.origin_m.mean(axis=0), atol=1e-12)
         orient = prim.GetAttribute("xformOp:orient").Get()
-        turn = turn_of(orient.GetReal(), *orient.GetImaginary())
+        turn = rotation_of_quaternion(orient.GetReal(), *orient.GetImaginary())
         core = {one.GetName().split(":")[-1]: one.Get() for one in prim.GetAttributes()}
-        ranges = np.stack([core["rangesMinM"], core["rangesMaxM"]], axis=1)
-        check_emitters(core, ranges, mine, turn)
+        # degrees: x forward, y to the left at +90, z up
+        looking = direction(*(np.radians(np.array(core[name], float)) for name in ("azimuthDeg", "elevationDeg")))
+        np.testing.assert_allclose(looking @ turn.T, mine.direction, atol=2e-7)
+        ranges = np.stack([core["rangesMinM"], core["rangesMaxM"]], axis=1)[list(core["rangeId"])]
+        np.testing.assert_allclose(ranges, np.maximum(mine.gate_m, 0.001), atol=3e-7)
+        times = np.array(core["fireTimeNs"], dtype=np.int64)
+        assert (np.abs(times - mine.time_s * 1e9) <= 1).all()
+        assert times.max() < 100_000_000
 
 
 def test_frames_are_whole_numbers_per_second(tmp_path):

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import find, given
+from hypothesis import given
 from hypothesis import strategies as st
+from support.rigs import rig
 from support.strategies import adaptive_designs
 
 from lidardesign.errors import ConfigError
 from lidardesign.formats.ray_lists import ray_columns
 from lidardesign.formats.registry import EXPORTERS
 from lidardesign.scenes.rays import Outcome, Returns
+from lidardesign.sensors.adaptive import AdaptivePatterns, PatternRule
 
 PAGE = Path(__file__).parents[2] / "docs" / "adaptive.md"
 
@@ -78,6 +81,8 @@ def test_a_csv_has_the_rays_and_the_rule_to_the_last_bit(tmp_path_factory, desig
 
 @pytest.mark.parametrize("name", [name for name in EXPORTERS if name not in ("csv", "npz", "sensors-csv", "stl")])
 def test_formats_that_cannot_hold_them_refuse_and_say_so(tmp_path, name):
-    design = find(adaptive_designs(), lambda design: True)
+    design, _ = rig()
+    following = AdaptivePatterns(PatternRule(np.zeros((1, 1)), 1, np.ones(1)), design.patterns * 2, np.ones(2) / 2)
+    design = replace(design, layout="chosen", adaptive=following)
     with pytest.raises(ConfigError, match="cannot hold patterns that follow what they see"):
         exported(design, name, tmp_path)

@@ -5,34 +5,20 @@ import math
 import re
 import shlex
 from dataclasses import replace
-from html.parser import HTMLParser
 from itertools import pairwise
 from xml.etree import ElementTree
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 from support.rigs import NASTY, rig
 
-from lidardesign.errors import ConfigError
 from lidardesign.formats.mount_page import mounted_parts
 from lidardesign.formats.registry import EXPORTERS
 from lidardesign.parts.catalogue import Pose, find_part, part_design
-from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import rotation_of_quaternion
-from lidardesign.scenes.scene import Body, Box, Scene, Sphere, rigid
 
-ROOM = Scene(
-    (
-        Body(Box((9.0, 9.0, 0.1)), "floor", poses=rigid(translation_m=(0.0, 0.0, -1.5))),
-        Body(Box((0.1, 9.0, 9.0)), "wall", poses=rigid(translation_m=(3.0, 0.0, 0.0))),
-        Body(Sphere(0.6), "ball", poses=rigid(translation_m=(1.4, 0.4, 0.2))),
-    ),
-    "room",
-)
-GEOMS = """<geom type="box" size="9 9 .1" pos="0 0 -1.5"/><geom type="box" size=".1 9 9" pos="3 0 0"/>
-<geom size=".6" pos="1.4 .4 .2"/>"""
 poses = st.builds(
     lambda place, azimuth, elevation, roll: Pose(np.array(place), azimuth, elevation, roll),
     st.tuples(*[st.floats(-0.5, 0.5)] * 3),
@@ -74,35 +60,7 @@ def looking(row):
     return np.stack([np.cos(angle), np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn)], axis=1)
 
 
-def test_whoever_builds_it_by_hand_in_mujoco_measures_our_distances(tmp_path):
-    import mujoco
-
-    design = part_design(
-        find_part("vl53l8cx"), [Pose(np.array([0.1, -0.4, 0.3]), 0.4, -0.3, 2.1), Pose(np.zeros(3), -0.2, -1.2, -0.7)]
-    )
-    bodies, sensors, number = [], [], 0
-    for row in written(design, tmp_path)[0]:
-        sites = []
-        for looks in looking(row):
-            sites.append(f'<site name="r{number}" zaxis="{" ".join(map(repr, looks.tolist()))}"/>')
-            sensors.append(f'<rangefinder site="r{number}"/>')
-            number += 1
-        place = values(row, "x_mm", "y_mm", "z_mm") / 1000
-        turn = values(row, "qw", "qx", "qy", "qz")
-        pose = f'pos="{" ".join(map(repr, place.tolist()))}" quat="{" ".join(map(repr, turn.tolist()))}"'
-        bodies.append(f"<body {pose}>{''.join(sites)}</body>")
-    model = mujoco.MjModel.from_xml_string(
-        f"<mujoco><worldbody>{GEOMS}{''.join(bodies)}</worldbody><sensor>{''.join(sensors)}</sensor></mujoco>"
-    )
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    rays = design.rays(design.count)
-    ours = SceneCaster(ROOM).first_hit(rays.origin_m, rays.direction)
-    assert set(ours.body.tolist()) >= {0, 2}
-    np.testing.assert_allclose(data.sensordata, np.where(ours.body >= 0, ours.range_m, -1.0), rtol=0, atol=1e-4)
-
-
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(pose=poses, name=st.sampled_from(["vl53l5cx", "tmf8828", "vl53l8cx:4x4"]))
 def test_the_zones_of_a_row_are_the_rays_of_the_design(tmp_path_factory, pose, name):
     design = part_design(find_part(name), pose)
@@ -112,7 +70,7 @@ def test_the_zones_of_a_row_are_the_rays_of_the_design(tmp_path_factory, pose, n
     np.testing.assert_allclose(values(row, "x_mm", "y_mm", "z_mm") / 1000, rays.origin_m[0], rtol=0, atol=1e-12)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(pose=poses)
 def test_every_form_of_a_pose_is_the_same_pose(tmp_path_factory, pose):
     folder = tmp_path_factory.mktemp("mounts")
@@ -135,38 +93,17 @@ def test_every_form_of_a_pose_is_the_same_pose(tmp_path_factory, pose):
     ):
         np.testing.assert_allclose(found, [*pose.origin_m, roll, pitch, yaw], rtol=0, atol=1e-9)
         # fixed axes, as URDF and tf2 mean them
-        about = [np.eye(3) for _ in range(3)]
-        for axis, angle in enumerate(found[3:]):
-            one, other = [number for number in range(3) if number != axis]
-            sine = math.sin(angle) * (-1 if axis == 1 else 1)
-            about[axis][[one, other], [one, other]] = math.cos(angle)
-            about[axis][one, other], about[axis][other, one] = -sine, sine
-        np.testing.assert_allclose((about[2] @ about[1] @ about[0]).T, axes, rtol=0, atol=1e-9)
-
-
-class Texts(HTMLParser):
-    """The tags and the text of a page."""
-
-    def __init__(self):
-        super().__init__()
-        self.tags, self.text = [], ""
-
-    def handle_starttag(self, tag, attrs):
-        self.tags.append(tag)
-
-    def handle_data(self, data):
-        self.text += data
+        np.testing.assert_allclose(Rotation.from_euler("xyz", found[3:]).as_matrix().T, axes, rtol=0, atol=1e-9)
 
 
 def test_the_page_says_what_no_source_says(tmp_path):
     written(part_design(find_part("tmf8828"), Pose()), tmp_path)
-    read = Texts()
-    read.feed((tmp_path / "mounts.html").read_text(encoding="utf-8"))
-    assert read.tags.count("svg") == 3
-    assert "script" not in read.tags
-    assert read.text.count("unknown") >= 5
+    page = (tmp_path / "mounts.html").read_text(encoding="utf-8")
+    assert page.count("<svg") == 3
+    assert "<script" not in page
+    assert page.count("unknown") >= 5
     for text in ("Before you drill", "41 x 52", "static_transform_publisher", "built in hardware"):
-        assert text in read.text
+        assert text in page
 
 
 def test_nothing_in_a_name_becomes_markup(tmp_path):
@@ -195,9 +132,3 @@ def test_labels_of_many_sensors_stay_on_the_sheet(tmp_path):
     places = re.findall(r'<text x="([-\d.]+)" y="([-\d.]+)" text-anchor="end"', text)
     assert len(places) > 80
     assert all(0 <= float(x) <= 340 and 0 <= float(y) <= 270 for x, y in places)
-
-
-def test_it_has_no_frame_rate(tmp_path):
-    design, rays = rig()
-    with pytest.raises(ConfigError, match="frame rate"):
-        EXPORTERS["mounts"].write(design, rays, tmp_path / "x", rate_hz=5)

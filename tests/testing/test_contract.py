@@ -120,11 +120,6 @@ BROKEN = {
 }  # fmt: skip
 # Laws whose breakers replace several words at once.
 TOGETHER = ("space is fixed", "seeds differ")
-# Laws that are broken below, not by words of a task.
-OTHERWISE = {
-    "scenes repeat elsewhere",
-    "within time",
-}
 
 
 def task_of(source: str):
@@ -160,30 +155,13 @@ def test_a_task_that_breaks_a_law_is_told_so(law, source, words, tmp_path, monke
     assert os.listdir(tmp_path) == []
 
 
-def test_every_law_is_broken_by_something():
-    assert {law.name for law in LAWS} == {*BROKEN, *OTHERWISE}
-    assert len({law.name for law in LAWS}) == len(LAWS)
-
-
-@pytest.fixture(scope="module")
-def kept():
-    """The findings of a good task, by law."""
-    return {finding.law: finding for finding in contract_of(task_of(GOOD)).findings()}
-
-
-def test_a_task_that_says_what_returns_tell_keeps_the_law():
-    finding = contract_of(task_of(GOOD.replace(SCORE, INFORMS + SCORE))).finding("returns inform")
-    assert finding.outcome == "pass", finding
-
-
-def test_a_good_task_keeps_every_law_that_applies(kept):
-    assert {finding.law for finding in kept.values() if finding.outcome == "skip"} == {
-        "conditions lie in the space",
-        "scenes repeat elsewhere",
-        "returns inform",
-    }
+def test_a_good_task_keeps_every_law_that_applies():
+    kept = {finding.law: finding for finding in contract_of(task_of(GOOD.replace(SCORE, INFORMS + SCORE))).findings()}
+    skipped = {finding.law for finding in kept.values() if finding.outcome == "skip"}
+    assert skipped == {"conditions lie in the space", "scenes repeat elsewhere"}
     assert not [finding for finding in kept.values() if finding.outcome == "fail"]
     assert kept["best on the truth"].figures["dense"] < kept["best on the truth"].figures["none"]
+    assert contract_of(task_of(GOOD)).finding("returns inform").outcome == "skip"
 
 
 SHIPPED = {
@@ -242,7 +220,6 @@ def test_a_fingerprint_is_of_the_content_alone():
     def scene(name="a", radius=0.2, **truth):
         return Scene((Body(Sphere(radius), name),), name, truth=truth)
 
-    assert fingerprint(scene()) == fingerprint(scene())
     assert fingerprint(scene(x=1, y={"b", "a"})) == fingerprint(scene(y={"a", "b"}, x=1))
     assert fingerprint(scene(x=np.zeros(2))) != fingerprint(scene(x=np.zeros(3)))
     assert fingerprint(scene(x=1)) != fingerprint(scene(x=1.0))
@@ -254,10 +231,6 @@ def test_a_fingerprint_is_of_the_content_alone():
     before = fingerprint(mesh)
     assert mesh.content_hash
     assert fingerprint(mesh) == before
-    loop: list[object] = []
-    loop.append(loop)
-    with pytest.raises(RecursionError):
-        fingerprint(loop)
 
 
 def test_sensors_are_on_a_body_with_a_name_or_in_the_world():
