@@ -78,12 +78,6 @@ def test_a_stated_share_is_that_of_the_rays_whatever_the_detector_and_the_number
         assert detected_share(design, 0.9, 0.18, 20, detector) == pytest.approx(0.9, abs=0.08)
 
 
-def test_parts_see_less_in_more_light_and_further_away():
-    design = of_part(find_part("vl53l5cx"))
-    shares = [detected_share(design, *at, ZONES) for at in ((1.1, 0.88, 0.1), (1.1, 0.88, 5), (1.3, 0.88, 5))]
-    assert shares[0] > shares[1] > shares[2]
-
-
 def test_light_is_the_detector_s_own_where_nothing_is_stated_or_nothing_counted():
     unknown, known = of_part(find_part("vl53l8cx")), of_part(find_part("vl53l5cx"))
     assert with_part_light(unknown.rays(), unknown, ZONES).light is None
