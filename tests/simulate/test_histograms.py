@@ -13,7 +13,7 @@ from support.synthetic_light import PHOTON_EFFECTS
 
 from lidardesign.errors import ConfigError
 from lidardesign.scenes.rays import Outcome
-from lidardesign.scenes.scene import SPEED_OF_LIGHT_M_S, Ambient, Body, Box, Plane, Scene, Sphere, rigid
+from lidardesign.scenes.scene import SPEED_OF_LIGHT_M_S, Ambient, Body, Plane, Scene, Sphere, rigid
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.detector.light import FIRST_NM, LED_AT_1_LUX, STEP_NM, SUN_AT_100_KLUX, spectral_irradiance
 from lidardesign.simulate.detector.physics import PLANCK_J_S, Physics, metres
@@ -173,19 +173,6 @@ def test_captures_of_no_rays_are_empty_and_need_a_detector_that_counts_photons()
     assert captured(scene, rays_towards(np.zeros((0, 3)), (0.3, 0.6)), PHOTON_EFFECTS).counts.shape == (0, 0)
     with pytest.raises(ConfigError, match="counts no photons"):
         captured(scene, rays_towards(directions, (0.3, 0.6)), {"jitter"}, load_detector("ideal"))
-
-
-def test_rays_keep_the_outcome_of_their_geometry_and_dark_surfaces_are_not_detected():
-    wall = Body(Box((0.05, 0.05, 0.05)), poses=rigid(None, (0.4, 0.0, 0.0)), reflectance=0.0)
-    far = Body(Sphere(0.5), poses=rigid(None, (0.0, 3.0, 0.0)))
-    near = Body(Sphere(0.05), poses=rigid(None, (0.0, -0.1, 0.0)))
-    scene = Scene((wall, far, near))
-    rays = rays_towards([[1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1]], (0.2, 1.0))
-    found = simulate(scene, rays, physics=Physics(DETECTOR, PHOTON_EFFECTS))[0]
-    expected = [Outcome.NOT_DETECTED, Outcome.AFTER_GATE, Outcome.OCCLUDED, Outcome.MISS]
-    assert found.outcome.tolist() == expected
-    assert np.isnan(found.range_m).all()
-    assert (found.body == -1).all()
 
 
 def test_noise_that_is_taken_for_a_return_belongs_to_no_body():

@@ -6,11 +6,9 @@ Without the simulator only its process and its absence are tested; everything el
 from __future__ import annotations
 
 import math
-import subprocess
 import sys
 from dataclasses import replace
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -120,8 +118,9 @@ def test_every_ray_has_the_gain_and_the_time_of_the_direct_component(name, recei
 
 
 @needs_simulator
-@pytest.mark.parametrize("emitter_m", [(0.0, 0.0, 0.0), (-0.02, -0.08, 0.05)], ids=["co-located", "elsewhere"])
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize(
+    ("name", "emitter_m"), [("sphere", (0.0, 0.0, 0.0)), *((name, (-0.02, -0.08, 0.05)) for name in ("plane", "face"))]
+)
 def test_the_transient_of_a_whole_view_has_the_same_peak_and_energy(name, emitter_m):
     """Forward: a spot light of 1 W and a camera of the simulator's, against our beams from the emitter."""
     receiver = Receiver((0, 0, 0), 0.0, 0.0, VIEW_RAD, VIEW_RAD, (0.0, 5.0))
@@ -234,18 +233,9 @@ def test_a_camera_fills_its_field_of_view():
     np.testing.assert_allclose(mean / np.linalg.norm(mean), ahead, atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("name", "version"),
-    [
-        ("libLLVM-19.so", 19),
-        ("libLLVM-19.so.1", 19),
-        ("libLLVM.so.19.1", 19),
-        ("libLLVM-14.0.6.so.1", 14),
-        ("libLLVMSupport.so", None),
-    ],
-)
-def test_versions_are_read_from_the_names_of_libraries(name, version):
-    assert process.llvm_version(name) == version
+def test_versions_are_read_from_the_names_of_libraries():
+    names = ("libLLVM-19.so", "libLLVM-19.so.1", "libLLVM.so.19.1", "libLLVM-14.0.6.so.1", "libLLVMSupport.so")
+    assert [process.llvm_version(name) for name in names] == [19, 19, 19, 14, None]
 
 
 def test_an_old_or_absent_library_is_not_used_even_if_it_is_named(monkeypatch, tmp_path):
@@ -287,34 +277,20 @@ def test_a_process_that_dies_or_takes_too_long_is_reported_with_what_it_said(mon
     process.end_worker()
     monkeypatch.setattr(process, "WORKER", f"support.work:{work}")
     monkeypatch.setattr(process, "missing", lambda: None)
-    for _ in range(2):
-        with pytest.raises(NumericalError) as caught:
-            process.ask({}, {}, limit_s=limit_s)
-        assert all(word in str(caught.value) for word in words)
-        assert not process._running
+    with pytest.raises(NumericalError) as caught:
+        process.ask({}, {}, limit_s=limit_s)
+    assert all(word in str(caught.value) for word in words)
+    assert not process._running
 
 
 @needs_simulator
-def test_the_simulator_runs_from_any_folder_and_is_imported_in_its_own_process_alone(tmp_path):
+def test_the_simulator_runs_from_any_folder_and_is_imported_in_its_own_process_alone(tmp_path, monkeypatch):
     (tmp_path / "mitsuba.py").write_text("raise SystemExit('the wrong one')")
-    code = (
-        "import sys\n"
-        f"sys.path.insert(0, {str(Path(__file__).parents[1])!r})\n"
-        "import numpy as np\n"
-        "from lidardesign.scenes.scene import Body, Scene, Sphere, rigid\n"
-        "from lidardesign.simulate.light_transport.transport import PathBins, render_transient\n"
-        "from support.transients import flood, rays_from, spiral\n"
-        "ball = Scene((Body(Sphere(0.12), poses=rigid(translation_m=(0.45, 0.01, 0.02))),))\n"
-        "rays = rays_from((0, 0, 0), spiral(4, 0.1))\n"
-        "found = render_transient(ball, 0, rays, flood(rays.origin_m[:1]), PathBins(0.1, 9))\n"
-        "assert found.steady.all()\n"
-        "assert not {'mitsuba', 'drjit', 'mitransient'} & set(sys.modules)\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-P", "-c", code],
-        cwd=tmp_path, capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    monkeypatch.chdir(tmp_path)
+    process.end_worker()
+    rays = rays_from((0, 0, 0), spiral(4, 0.1))
+    assert render_transient(sphere_scene(), 0, rays, flood(rays.origin_m[:1]), PathBins(0.1, 9)).steady.all()
+    assert not {"mitsuba", "drjit", "mitransient"} & set(sys.modules)
 
 
 @needs_simulator

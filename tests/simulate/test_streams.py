@@ -103,7 +103,7 @@ def test_small_poisson_quantiles_are_exact(mean):
 
 @pytest.mark.parametrize("mean", [32.1, 500.0, 1e6])
 def test_large_poisson_quantiles_are_off_by_one_count_at_most_and_seldom(mean):
-    shares = along_rows(8)[:20_000]
+    shares = along_rows(8)[:5000]
     off = np.array([poisson_quantile(mean, share) for share in shares]) - poisson.ppf(shares, mean)
     assert np.abs(off).max() <= 1
     assert np.mean(off != 0) < 0.02
