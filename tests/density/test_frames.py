@@ -11,7 +11,6 @@ from support import references
 
 from lidardesign.config import DensitySettings
 from lidardesign.density.fields.bodies import Pairs, collect_bodies, occluding_bodies
-from lidardesign.density.fields.distance import BodyField
 from lidardesign.density.objective.proposals import independent_points
 from lidardesign.density.objective.surfaces import MovingFrames
 from lidardesign.density.objective.target import build_target
@@ -136,38 +135,6 @@ def test_parts_of_all_frames_average_to_the_whole():
     order = np.random.default_rng(3).permutation(target.columns)
     parts = [target.subsample(np.sort(part)).log_density(points) for part in np.split(order, 3)]
     np.testing.assert_allclose(np.exp(parts).mean(axis=0), np.exp(target.log_density(points)), rtol=1e-9)
-
-
-def test_bodies_are_found_by_their_boxes_as_by_looking_at_all():
-    scenes = moving_scenes(frames=4)
-    bodies = collect_bodies(scenes, lambda body: not isinstance(body.shape, Plane), resolution=24, padding_m=0.1)
-    points = np.random.default_rng(5).uniform(-0.6, 0.8, (400, 3))
-    everything = BodyField(bodies).distances(points)
-    from lidardesign.density.objective.surfaces import near_pairs
-
-    pairs = near_pairs(bodies, points, np.zeros(bodies.columns), 0.05, 1e9)
-    np.testing.assert_array_equal(pairs.columns, np.tile(np.arange(bodies.columns), len(points)))
-    np.testing.assert_allclose(pairs.distances, everything.ravel(), atol=1e-12)
-
-
-@pytest.mark.parametrize("with_mesh", [False, True], ids=["primitives", "meshes"])
-def test_first_hits_of_pairs_are_those_of_the_scene(with_mesh):
-    scenes = moving_scenes(frames=3, with_mesh=with_mesh)
-    visibility = BodyRaycast(occluding_bodies(scenes))
-    generator = np.random.default_rng(7)
-    points = CEILING.sample(400, generator)
-    rays = RayBatch(points[:, :3].copy(), direction(points[:, AZIMUTH], points[:, ELEVATION]), points[:, 5].copy())
-    columns = 9
-    pairs = Pairs(np.arange(401) * columns, np.tile(np.arange(columns), 400), np.zeros(3600), np.zeros(3600, int))
-    limit = np.full(400, 1.4)
-    hits, normals = visibility.first_hits(rays, pairs, limit)
-    hits, normals = hits.reshape(400, columns), normals.reshape(400, columns, 3)
-    for column in range(columns):
-        one = SceneCaster(scenes[column // 3], column % 3, only="occluders").trace(rays.origins, rays.directions, limit)
-        np.testing.assert_allclose(hits[:, column], one.range_m, rtol=1e-5)
-        # embree's normals near an edge of the cube may be of either face
-        same = np.einsum("nk,nk->n", normals[:, column], one.normal) > 0.999
-        assert same[np.isfinite(one.range_m)].mean() > 0.98
 
 
 def first_hits_of_one_column(shapes_and_poses, origin, toward, limit_m=10.0):

@@ -37,19 +37,6 @@ def test_an_interrupted_run_over_moving_frames_is_resumed_to_the_bytes_of_a_stra
     assert not list(tmp_path.rglob("MUJOCO_LOG*"))
 
 
-@pytest.mark.slow
-def test_one_frame_per_step_is_enough_to_learn_something_finite(lidardesign):
-    result = learn(lidardesign, "one", "--set", "learning.frames=1", "--set", "learning.dtype=float64")
-    assert result.code == 0, result.err
-    assert 0 < result.json["ess"] <= 1
-
-
-def test_a_space_too_narrow_for_any_ray_is_refused_before_learning(lidardesign):
-    done = learn(lidardesign, "run", "--set", "elevation_max_deg=-89.9")
-    assert done.code == 3
-    assert "no ray of the design space" in done.json["error"]["message"]
-
-
 def test_coverage_that_cannot_be_measured_counts_as_none_and_is_said(lidardesign, monkeypatch):
     draw = quality.independent_points
 

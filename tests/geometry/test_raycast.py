@@ -53,7 +53,7 @@ def test_primitives_are_hit_where_marching_along_their_distance_arrives(name):
     def world_distance(points):
         return distance((points - POSE[:3, 3]) @ POSE[:3, :3])
 
-    origins, directions = rays_towards(2000, 1)
+    origins, directions = rays_towards(800, 1, spread=0.4)
     outside = world_distance(origins) > 0
     origins, directions = origins[outside], directions[outside]
     marched = references.marched_hit(world_distance, origins, directions, 1e4)
@@ -83,31 +83,6 @@ def test_normals_are_the_gradient_of_the_distance_and_face_the_ray(name):
     assert (np.einsum("nk,nk->n", hits.normal[hit], directions[hit]) <= 0).all()
     assert (hits.normal[~hit] == 0).all()
     assert (hits.body[~hit] == -1).all()
-
-
-TESSELLATED = {
-    "sphere": (Sphere(0.7), lambda: trimesh.creation.icosphere(subdivisions=5, radius=0.7)),
-    "box": (Box((0.3, 0.5, 0.9)), lambda: trimesh.creation.box((0.6, 1.0, 1.8))),
-    "cylinder": (Cylinder(0.4, 0.8), lambda: trimesh.creation.cylinder(0.4, 1.6, sections=256)),
-    "ellipsoid": (
-        Ellipsoid((0.3, 0.5, 0.9)),
-        lambda: trimesh.creation.icosphere(subdivisions=5).apply_scale((0.3, 0.5, 0.9)),
-    ),
-}
-
-
-@pytest.mark.parametrize("name", TESSELLATED)
-def test_primitives_and_their_tessellations_are_hit_at_the_same_range(name):
-    shape, tessellation = TESSELLATED[name]
-    origins, directions = rays_towards(3000, 3, spread=0.3)
-    exact = SceneCaster(Scene((Body(shape),))).first_hit(origins, directions)
-    mesh = SceneCaster(Scene((Body(solid_mesh(tessellation())),))).first_hit(origins, directions)
-    both = np.isfinite(exact.range_m) & np.isfinite(mesh.range_m)
-    assert both.sum() > 1000
-    steep = both & (np.abs(np.einsum("nk,nk->n", exact.normal, directions)) > 0.5)
-    faceting = 0.0 if name == "box" else 4e-4
-    difference = np.abs(exact.range_m[steep] - mesh.range_m[steep])
-    assert difference.max() < 2 * (faceting + references.EMBREE_M)
 
 
 @pytest.mark.parametrize("name", SOLIDS)
@@ -392,7 +367,3 @@ def test_scenes_of_the_same_bodies_share_what_is_built_of_their_meshes_and_other
     resting = [SceneCaster(scene).at_rest for scene in (first, second, alone)]
     assert resting[0] is resting[1]
     assert resting[2] is not resting[0]
-    turned = Scene(tuple(balls[::-1]), "turned")
-    ray = np.zeros((1, 3)), np.array([[1.0, 0, 0]])
-    assert SceneCaster(first).first_hit(*ray).body[0] == 0
-    assert SceneCaster(turned).first_hit(*ray).body[0] == 1

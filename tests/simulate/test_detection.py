@@ -276,16 +276,6 @@ def test_light_of_several_sources_is_the_sum_of_what_each_brings_alone():
     assert np.array_equal(together, signal + haze + ambient)
 
 
-def test_jitter_moves_photons_and_takes_none_away():
-    rays = 200
-    detector = counting_detector(rays, **FULL)
-    gate, echoes = windows(rays, 1.0, 3.0), single_echoes(np.full(rays, 2.0), 100.0)
-    still, _ = counted(gate, echoes, background(rays), detector, {"photon_noise", "quantisation"})
-    moved, _ = counted(gate, echoes, background(rays), detector, {"photon_noise", "jitter", "quantisation"})
-    assert np.array_equal(still.sum(axis=1), moved.sum(axis=1))
-    assert not np.array_equal(still, moved)
-
-
 def test_a_little_less_light_takes_a_few_photons_and_leaves_the_others():
     rays = 500
     detector = counting_detector(rays, **FULL)
@@ -315,13 +305,6 @@ def test_no_light_is_not_detected():
         assert (found.body == -1).all()
 
 
-@pytest.mark.parametrize("effects", [ALL, {"footprint"}])
-@pytest.mark.parametrize("detector", [counting_detector(1, **FULL), Detector("timing", bin_s=BIN_S)])
-def test_an_empty_list_of_rays_has_an_empty_result(detector, effects):
-    found = detected(np.zeros((0, 2)), no_echoes(), background(0), detector, effects)
-    assert found.path_m.shape == found.body.shape == (0,)
-
-
 class TestTimingOnly:
     """Detectors that count no photons."""
 
@@ -339,12 +322,6 @@ class TestTimingOnly:
         found = detected(windows(1, 1.0, 3.0), echoes, background(1), self.ideal, {"footprint"})
         assert found.path_m[0] == 2.5
         assert found.body[0] == 2
-
-    def test_gates_are_closed_at_their_start_and_open_at_their_end(self):
-        echoes = single_echoes([1.0, 3.0], 1.0)
-        found = detected(windows(2, 1.0, 3.0), echoes, background(2), self.ideal, {"footprint"})
-        assert found.path_m[0] == 1.0
-        assert np.isnan(found.path_m[1])
 
     def test_echoes_closer_than_its_resolution_are_one_at_their_mean_by_strength(self):
         width = metres(FWHM_PER_SIGMA * SIGMA_S)

@@ -11,7 +11,7 @@ from scipy.stats import norm
 from support.references import first_photon_distribution
 
 from lidardesign.simulate.detector.dead_time import alive_shares, find_corrected
-from lidardesign.simulate.detector.kernels import at_least, find_returns, pulse_shape
+from lidardesign.simulate.detector.kernels import at_least, find_returns
 
 WHOLE = np.ones((1, 2))
 SIGMA, HALF = 2.5, 2
@@ -47,16 +47,6 @@ def test_tails_of_very_bright_light_are_normal_and_whole_at_their_edges():
     assert at_least(0, 3.0) == 1
     assert at_least(1, 0.0) == 0
     assert at_least(2, 3.0) == 1
-
-
-def test_the_pulse_s_shape_is_even_and_whole():
-    for sigma in (0.0, 0.1, 1.0, 7.3):
-        shape = pulse_shape(1.0, sigma, 1000)
-        # four standard deviations to either side leave 6e-5
-        assert shape.sum() == pytest.approx(1.0, abs=1e-4)
-        np.testing.assert_allclose(shape, shape[::-1])
-        assert len(pulse_shape(1.0, sigma, 5)) <= 9
-    assert np.array_equal(pulse_shape(1.0, 0.0, 10), [1.0])
 
 
 @pytest.mark.parametrize("centre", [12.5, 12.6, 12.9, 13.0, 40.2])

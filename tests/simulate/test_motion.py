@@ -39,21 +39,6 @@ SHAPES = {
 }
 
 
-def test_a_flying_ball_is_hit_where_it_is_at_each_rays_time():
-    velocity, start = np.array([4.0, -3.0, 1.0]), np.array([3.0, 0.2, 0.0])
-    scene = Scene((Body(Sphere(0.5), poses=rigid(translation_m=start), velocity_m_s=tuple(velocity)),))
-    origins, looking, time_s = fan()
-    hits = moving_tracer(scene, 0)(origins, looking, time_s)
-    centre = start + time_s[:, None] * velocity
-    along = np.einsum("nk,nk->n", centre, looking)
-    root = along**2 - np.einsum("nk,nk->n", centre, centre) + 0.25
-    assert np.array_equal(hits.body == 0, root > 0)
-    hit = root > 0
-    assert hits.range_m[hit] == pytest.approx(along[hit] - np.sqrt(root[hit]), abs=1e-7)
-    points = hits.range_m[hit, None] * looking[hit]
-    assert hits.normal[hit] == pytest.approx((points - centre[hit]) / 0.5, abs=1e-7)
-
-
 @pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
 def test_every_ray_sees_what_a_scene_at_rest_at_its_time_shows(shape):
     generator = np.random.default_rng(3)

@@ -167,18 +167,6 @@ def test_bounces_add_up_to_a_geometric_series_and_to_a_finite_one_between_white_
     assert math.isfinite(series(1.0))
 
 
-def test_bounds_do_not_depend_on_where_a_scene_is():
-    here = bounded(corner(), into_the_corner(50), FLOOD)
-    moved = np.array([3.0, -2.0, 0.0])
-    there = Scene(
-        tuple(replace(body, poses=rigid(body.pose()[:3, :3], body.pose()[:3, 3] + moved)) for body in corner().bodies)
-    )
-    rays = into_the_corner(50)
-    shifted = bounded(there, replace(rays, origin_m=rays.origin_m + moved), FLOOD)
-    np.testing.assert_allclose(here.share, shifted.share, rtol=1e-6)
-    np.testing.assert_allclose(here.shift_m, shifted.shift_m, rtol=1e-6)
-
-
 def test_rays_that_meet_nothing_have_no_bound():
     rays = rays_from((0, 0, 5), np.array([[0.0, 0, 1]]))
     assert not len(bounded(ball(), rays, FLOOD).chosen)
