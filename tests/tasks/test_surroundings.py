@@ -108,10 +108,6 @@ def test_fog_leaves_a_fiftieth_of_a_contrast_at_its_visibility():
     assert medium.extinction_per_m / medium.backscatter_per_m_sr == pytest.approx(18.8)
 
 
-def test_darkness_is_no_light_at_all(folder):
-    assert scene_of("flatland", folder, illuminance_lux=0).ambient is None
-
-
 def test_the_guides_surroundings_change_what_a_photon_counter_reports(folder):
     page = Path(__file__).parents[2] / "docs" / "writing-tasks.md"
     (block,) = re.findall(r"```python\n(from dataclasses.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
