@@ -48,7 +48,7 @@ from lidardesign.simulate.effects.expected_counts import (
     share_in_bins,
 )
 from lidardesign.simulate.effects.first_hits import FirstHits, edge_probability
-from lidardesign.simulate.effects.motion import entered_rays, moving_tracer, point_velocities
+from lidardesign.simulate.effects.motion import entered_rays, moving_tracer
 from lidardesign.simulate.effects.multipath import _detours, _moved_m
 from lidardesign.simulate.plan import Planner
 from lidardesign.simulate.returns import followed_light, photon_histograms, simulate
@@ -169,22 +169,6 @@ def test_the_share_of_beams_on_a_depth_edge_is_that_of_drawn_edges():
     error = np.std(np.array(found) - np.array(true)) / math.sqrt(40)
     assert np.mean(found) >= np.mean(true) - 4 * error
     assert np.mean(found) <= 4 * np.mean(true) + 4 * error
-
-
-def test_points_of_moving_bodies_move_with_them():
-    angle, rate = 0.01, 20.0
-    turned = rigid(np.array([[math.cos(angle), -math.sin(angle), 0], [math.sin(angle), math.cos(angle), 0], [0, 0, 1]]))
-    place = rigid(translation_m=(1.0, 0, 0))
-    ball = Body(Sphere(0.3), poses=np.stack([place, turned @ place, turned @ turned @ place]))
-    scene = Scene((ball,), frame_rate_hz=rate)
-    for frame in (0, 1, 2):
-        seen = sight(scene, TIMED, frame=frame)
-        points = seen.rays.origin_m + seen.range_m[:, None] * seen.rays.direction
-        met = seen.hits.body == 0
-        speed = np.linalg.norm(point_velocities(seen), axis=1)
-        expected = angle * rate * np.hypot(points[met, 0], points[met, 1])
-        assert speed[met] == pytest.approx(expected, rel=1e-4)
-        assert not speed[~met].any()
 
 
 def test_a_receiver_loses_what_lies_outside_its_view_and_may_lose_all_it_does_not_share():

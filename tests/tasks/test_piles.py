@@ -14,9 +14,9 @@ from pydantic import ValidationError
 from scipy.optimize import linprog
 from scipy.spatial import ConvexHull
 from support.meshes import write_ball
+from support.rays import rays_of_points
 
 from lidardesign.errors import DataError
-from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Box, Mesh
 from lidardesign.simulate.returns import simulate
 from lidardesign.space import aim
@@ -146,8 +146,7 @@ def test_random_rays_score_alike_with_and_without_the_background(folder, kind):
     with_it, without, taken_for_it = [], [], []
     for scene in task.scenes(config, "test", 0, space):
         design = space.sample(361, np.random.default_rng(5))
-        gates = np.tile([0.0, space.high[5]], (len(design), 1))
-        rays = Rays.from_angles(design[:, :3], design[:, 3], design[:, 4], gates, np.zeros(len(design), dtype=int))
+        rays = rays_of_points(design, (0.0, space.high[5]))
         bare = replace(scene, bodies=tuple(body for body in scene.bodies if body.is_target))
         with_it.append(task.score(scene, simulate(scene, rays)).value)
         without.append(task.score(bare, simulate(bare, rays)).value)
@@ -163,8 +162,7 @@ def test_returns_on_the_background_tell_nothing_and_spoil_nothing(folder):
     space = task.space(config)
     scene = task.scenes(config, "train", 0, space)[0]
     design = space.sample(2000, np.random.default_rng(1))
-    gates = np.tile([0.0, space.high[5]], (len(design), 1))
-    rays = Rays.from_angles(design[:, :3], design[:, 3], design[:, 4], gates, np.zeros(len(design), dtype=int))
+    rays = rays_of_points(design, (0.0, space.high[5]))
     information = task.informs(scene, simulate(scene, rays))
     assert len(information.ray)
     assert not information.harm.any()

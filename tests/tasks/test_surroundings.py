@@ -54,16 +54,6 @@ def scene_of(name, folder, **changes):
 
 
 @pytest.mark.parametrize("name", FEW)
-def test_by_default_a_scene_is_matt_and_rests_in_clear_air_in_the_light_of_a_room(name, folder):
-    scene = scene_of(name, folder)
-    assert scene.ambient == Ambient(300.0, "indoor")
-    assert scene.medium is None
-    for body in scene.bodies:
-        assert (body.reflectance, body.specular, body.transmission) == (0.5, 0.0, 0.0)
-        assert not any(body.velocity_m_s)
-
-
-@pytest.mark.parametrize("name", FEW)
 def test_surroundings_reach_the_scene_and_leave_its_geometry_and_truth(name, folder):
     harsh = {**HARSH, **({"speed_m_s": 3.0} if name in MOVING else {})}
     calm, changed = scene_of(name, folder), scene_of(name, folder, **harsh)

@@ -20,6 +20,7 @@ from support.rays import rays_of_points
 
 from lidardesign.contract import contract_of
 from lidardesign.contract.contract import LAWS
+from lidardesign.contract.law import fingerprint
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.rays.coverage import InformedScene, gather
 from lidardesign.rays.information import checked_information
@@ -96,16 +97,6 @@ def rays_at_truth(task, config, scene, count) -> Rays:
     design = aim(origins, points)
     gates = np.clip(design[:, 5:] + np.array([-HALF_GATE_M, HALF_GATE_M]), 0, None)
     return rays_of_points(design, gates)
-
-
-def bodies_equal(first: Scene, second: Scene) -> bool:
-    def content(scene):
-        return [
-            (body.name, body.role, body.pose().tobytes(), getattr(body.shape, "content_hash", body.shape))
-            for body in scene.bodies
-        ]
-
-    return content(first) == content(second)
 
 
 @each_case
@@ -191,7 +182,7 @@ def test_points_of_a_region_count_as_much_as_it_does():
 def test_more_scenes_keep_the_first_ones():
     for kind, values in ((FaceTask, {"truth_points": 200}), (FlatlandTask, {})):
         few, more = (kind().scenes(kind.Config(**values, train=n), "train", 0) for n in (1, 3))
-        assert bodies_equal(few[0], more[0])
+        assert fingerprint(few[0]) == fingerprint(more[0])
 
 
 def test_the_truth_follows_a_design_space_that_a_run_sets():

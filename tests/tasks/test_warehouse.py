@@ -122,14 +122,6 @@ def test_more_bays_mean_more_poles(bays, at_least):
         assert sum(name.startswith("pole") for name in names) >= at_least
 
 
-def test_the_full_size_has_the_counts_of_the_paper_and_explicit_ones_win():
-    full = WarehouseConfig()
-    assert [full.count(name) for name in ("train", "test", "positions")] == [100, 40, 20]
-    assert len(TASK.scenes(SMALL, "train", 0)) == 6
-    assert len(TASK.scenes(WarehouseConfig(size="small", test=2), "test", 0)) == 2
-    assert len(TASK.conditions(WarehouseConfig(size="small", positions=0))) == len(PAPER_POSITIONS_M)
-
-
 @pytest.mark.parametrize("config", [WarehouseConfig(), SMALL, WarehouseConfig(positions=100)])
 def test_designs_are_evaluated_at_the_papers_positions_and_others_all_inside_the_aisle(config):
     values = [one["x_m"] for one in conditions_of(TASK, config, TASK.space(config))]
@@ -250,13 +242,6 @@ def test_the_truth_follows_a_design_space_that_a_run_sets(shelves):
     for few, all_of_them in zip(scene.truth["visible"], full.truth["visible"], strict=True):
         assert set(few) <= set(all_of_them)
         assert not any(scene.bodies[index].name.startswith(("box 2", "box 3")) for index in few)
-
-
-def test_the_truth_of_a_shelf_is_found_when_it_is_asked_for():
-    scene = TASK.scenes(SMALL, "train", 0)[0]
-    assert not {"cuts", "visible", "standing"} & set(vars(scene.truth))
-    assert set(scene.truth) == {"visible", "standing"}
-    assert len(scene.truth["visible"]) == len(TASK.conditions(SMALL))
 
 
 def test_a_return_per_position_is_asked_for(shelves):
