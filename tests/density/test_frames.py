@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 from support import references
 
 from lidardesign.config import DensitySettings
@@ -28,22 +29,15 @@ ALL = SETTINGS.model_copy(update={"surface_tolerance_nats": 1e6})
 pytestmark = pytest.mark.usefixtures("own_cache")
 
 
-def turned(generator):
-    """A random rotation, shape (3, 3)."""
-    q, r = np.linalg.qr(generator.normal(size=(3, 3)))
-    q = q * np.sign(np.diag(r))
-    return q if np.linalg.det(q) > 0 else -q
-
-
 def tracks(generator, frames):
     """Poses that wander through the space below the ceiling, (frames, 4, 4)."""
     ends = generator.uniform([-0.4, -0.4, 0.1], [0.4, 0.4, 0.5], (2, 3))
     share = np.linspace(0, 1, frames)[:, None]
-    rotation = turned(generator)
+    rotation = Rotation.random(random_state=generator).as_matrix()
     return np.stack([rigid(rotation, place) for place in (1 - share) * ends[0] + share * ends[1]])
 
 
-def cube(generator):
+def cube():
     mesh = trimesh.creation.box((0.1, 0.14, 0.2))
     return Mesh(mesh.vertices, mesh.faces)
 
@@ -51,7 +45,7 @@ def cube(generator):
 def moving_scenes(seed=0, scenes=3, frames=7, with_mesh=True):
     """Balls carried under links of every kind."""
     generator = np.random.default_rng(seed)
-    mesh = cube(generator)
+    mesh = cube()
     result = []
     for index in range(scenes):
         path = tracks(generator, frames)
@@ -147,7 +141,7 @@ def first_hits_of_one_column(shapes_and_poses, origin, toward, limit_m=10.0):
 
 
 def test_of_more_meshes_along_a_ray_than_there_is_room_for_the_nearest_is_met():
-    mesh = cube(None)
+    mesh = cube()
     row = [(mesh, rigid(translation_m=(0.5 * n, 0, 0))) for n in range(12, 0, -1)]
     range_m, normal = first_hits_of_one_column(row, (0, 0.01, 0.02), (1, 0, 0))
     assert range_m == pytest.approx(0.45, abs=1e-6)
@@ -198,7 +192,7 @@ def test_a_quadrature_over_thousands_of_bodies_is_refused():
 
 def test_a_frame_costs_a_pose_and_no_grid_even_where_scenes_have_copies_of_a_mesh():
     generator = np.random.default_rng(0)
-    scenes = [Scene((Body(cube(generator), "part", "target", tracks(generator, 250)),)) for _ in range(2)]
+    scenes = [Scene((Body(cube(), "part", "target", tracks(generator, 250)),)) for _ in range(2)]
     bodies = collect_bodies(scenes, lambda body: True, resolution=16, padding_m=0.05)
     assert bodies.columns == 500
     assert len(bodies.grids.meshes) == 1

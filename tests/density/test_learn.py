@@ -105,8 +105,6 @@ def test_resuming_a_finished_run_changes_nothing(finished, tmp_path):
 
 def test_the_result_has_sensible_figures_and_files(finished):
     run, result = finished
-    assert 0 < result.ess <= 1
-    assert result.kl_nats >= 0
     assert 0 <= result.coverage <= 1
     assert math.isfinite(result.log_z)
     samples = load_samples(run)
@@ -273,20 +271,6 @@ def test_a_run_lists_its_snapshots_with_their_hashes(finished):
     assert stored_snapshots(run) == {step: snapshot_name(step) for step in (50, 100)}
     for name in stored_snapshots(run).values():
         verify(run, name)
-
-
-def test_snapshots_hold_the_weights_of_the_flow_on_the_way_to_its_last_ones(finished):
-    run, _ = finished
-    last, _ = load_arrays(run, "flow.safetensors")
-    early, state = load_arrays(run, snapshot_name(50))
-    late, _ = load_arrays(run, snapshot_name(100))
-    assert state["step"] == 50
-    assert early.keys() == last.keys()
-
-    def distance(weights):
-        return sum(float(np.square(weights[key] - last[key]).sum()) for key in last if last[key].dtype.kind == "f")
-
-    assert distance(early) > distance(late) > 0
 
 
 def test_clearing_keeps_earlier_snapshots_and_removes_what_a_killed_process_left(finished, tmp_path):

@@ -108,11 +108,3 @@ def test_a_capsule_without_length_is_a_ball_in_moving_scenes_too():
 def test_every_point_is_visited_once(count):
     points = np.random.default_rng(0).normal(size=(count, 3))
     np.testing.assert_array_equal(np.sort(nearby_order(points)), np.arange(count))
-
-
-def test_points_are_visited_neighbour_after_neighbour_whatever_their_scale_and_place():
-    points = np.random.default_rng(1).uniform(size=(2000, 3)) * (1.0, 5.0, 0.1)
-    step = np.linalg.norm(np.diff(points[nearby_order(points)], axis=0), axis=1).mean()
-    assert step < 0.25 * np.linalg.norm(np.diff(points, axis=0), axis=1).mean()
-    points = np.random.default_rng(3).integers(0, 1024, size=(300, 3)).astype(float)
-    np.testing.assert_array_equal(nearby_order(points), nearby_order(8 * points + 4096))

@@ -125,11 +125,6 @@ def test_no_ray_slips_through_the_seam_between_a_capsules_side_and_its_caps():
     np.testing.assert_allclose(hits.range_m, np.linalg.norm(directions, axis=1), atol=1e-9)
 
 
-def test_no_rays_have_no_hits():
-    for shape in (Sphere(1.0), solid_mesh(trimesh.creation.box((1, 1, 1)))):
-        assert SceneCaster(Scene((Body(shape),))).first_hit(np.zeros((0, 3)), np.zeros((0, 3))).range_m.shape == (0,)
-
-
 def mixed_scene(shift=(0.0, 0.0, 0.0)):
     moved = rigid(translation_m=shift)
     mesh = solid_mesh(trimesh.creation.icosphere(subdivisions=3, radius=0.5))
@@ -185,18 +180,6 @@ def test_chunks_of_rays_do_not_change_the_bits():
     parts = [caster.first_hit(origins[rows], directions[rows]) for rows in chunks]
     for name in ("range_m", "body", "normal"):
         assert getattr(whole, name).tobytes() == np.concatenate([getattr(part, name) for part in parts]).tobytes()
-
-
-def test_a_scene_far_from_the_origin_is_hit_as_precisely():
-    shift = np.array([1e5, -2e5, 3e4])
-    origins, directions = rays_towards(1000, 12)
-    near = SceneCaster(mixed_scene()).first_hit(origins, directions)
-    far = SceneCaster(mixed_scene(shift)).first_hit(origins + shift, directions)
-    same = near.body == far.body
-    assert same.mean() > 0.999
-    hit = same & (near.body >= 0) & (np.abs(np.einsum("nk,nk->n", near.normal, directions)) > 0.1)
-    # positions of 2e5 m carry 3e-11 m of rounding in float64, Embree's own rounding comes on top
-    np.testing.assert_allclose(far.range_m[hit], near.range_m[hit], atol=10 * references.EMBREE_M)
 
 
 def test_rays_that_start_far_away_are_advanced_before_float32():

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from scipy.stats import norm, poisson
+from scipy.stats import poisson
 from soak.promise import random_case
 from support.meshes import icosphere
 from support.planning import (
@@ -45,7 +45,6 @@ from lidardesign.simulate.detector.physics import Physics, metres
 from lidardesign.simulate.effects.expected_counts import (
     Blindness,
     needed_counts,
-    share_in_bins,
 )
 from lidardesign.simulate.effects.first_hits import FirstHits, edge_probability
 from lidardesign.simulate.effects.motion import entered_rays, moving_tracer
@@ -92,14 +91,6 @@ def test_a_return_needs_the_fewest_counts_that_background_rarely_reaches(mean, b
     assert needed >= 1
     assert bins * poisson.sf(needed - 1, mean) <= allowed * rounding
     assert needed == 1 or bins * poisson.sf(needed - 2, mean) * rounding > allowed
-
-
-def test_a_bin_holds_its_share_of_an_echo_on_its_edge():
-    bin_m, sigma_s = 0.01, 2e-11
-    assert share_in_bins(1, bin_m, metres(sigma_s)) == pytest.approx(norm.cdf(bin_m / metres(sigma_s)) - 0.5)
-    three = norm.cdf(2 * bin_m / metres(sigma_s)) - norm.cdf(-bin_m / metres(sigma_s))
-    assert share_in_bins(3, bin_m, metres(sigma_s)) == pytest.approx(three)
-    assert (share_in_bins(1, bin_m, 0.0), share_in_bins(3, bin_m, 0.0)) == (0.5, 1.0)
 
 
 @pytest.mark.parametrize("signal", [0.0, 3.0, 20.0, 80.0])

@@ -10,7 +10,7 @@ import pytest
 
 from lidardesign.errors import ConfigError
 from lidardesign.simulate.detector.files import CHOICES, FOLDER, QUANTITIES, detector_names, load_detector
-from lidardesign.simulate.detector.physics import FWHM_PER_SIGMA, IDEAL, metres
+from lidardesign.simulate.detector.physics import IDEAL, metres
 
 ROOT = Path(__file__).parents[2]
 LIGHT = """\
@@ -40,12 +40,6 @@ def test_presets_load_bear_their_own_name_and_say_why_beside_every_number(name):
     for line in (FOLDER / f"{name}.yaml").read_text(encoding="utf-8").splitlines():
         if re.match(r"\w+: *[0-9.]+", line) and not line.startswith("false_alarm"):
             assert "#" in line, line
-
-
-def test_the_single_photon_preset_is_the_paper_s():
-    detector = load_detector("single-photon")
-    assert FWHM_PER_SIGMA * detector.timing_sigma_s == pytest.approx(50e-12, rel=0.02)
-    assert detector.bin_s == pytest.approx(8e-12)
 
 
 def test_widths_at_half_maximum_become_standard_deviations(tmp_path):

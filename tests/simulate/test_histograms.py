@@ -12,7 +12,6 @@ from support.references import STANDARD_ERRORS
 from support.synthetic_light import PHOTON_EFFECTS
 
 from lidardesign.errors import ConfigError
-from lidardesign.scenes.rays import Outcome
 from lidardesign.scenes.scene import SPEED_OF_LIGHT_M_S, Ambient, Body, Plane, Scene, Sphere, rigid
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.detector.light import FIRST_NM, LED_AT_1_LUX, STEP_NM, SUN_AT_100_KLUX, spectral_irradiance
@@ -155,17 +154,6 @@ def test_captures_of_no_rays_are_empty_and_need_a_detector_that_counts_photons()
     assert captured(scene, rays_towards(np.zeros((0, 3)), (0.3, 0.6)), PHOTON_EFFECTS).counts.shape == (0, 0)
     with pytest.raises(ConfigError, match="counts no photons"):
         captured(scene, rays_towards(directions, (0.3, 0.6)), {"jitter"}, load_detector("ideal"))
-
-
-def test_noise_that_is_taken_for_a_return_belongs_to_no_body():
-    noisy = replace(DETECTOR, photons=replace(DETECTOR.photons, dark_hz=3e6), false_alarm=0.3)
-    scene = ceiling(2.0)
-    rays = rays_towards(np.tile([0.0, 0.0, -1.0], (500, 1)), (0.5, 1.5))
-    found = simulate(scene, rays, physics=Physics(noisy, PHOTON_EFFECTS))[0]
-    assert 0 < found.returned.mean() < 0.3 + STANDARD_ERRORS * math.sqrt(0.3 * 0.7 / 500)
-    assert (found.body == -1).all()
-    assert (found.range_m[found.returned] >= 0.5).all()
-    assert set(found.outcome.tolist()) == {Outcome.RETURN, Outcome.MISS}
 
 
 @pytest.mark.parametrize("choice", ["auto", "none", "all"])

@@ -12,6 +12,7 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from support.transients import binned, flood, needs_simulator, pixel_rays, rays_from, spiral, spot
 
 from lidardesign.errors import ConfigError, NumericalError
@@ -42,11 +43,7 @@ ENERGY, MOST_ENERGY = 1e-5, 5e-3
 BIN_M = 0.0075
 PULSE_FWHM_M = 0.015
 VIEW_RAD = 0.9
-
-
-def turned(seed: int) -> np.ndarray:
-    rotation = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
-    return rotation * np.sign(np.linalg.det(rotation))
+TURNED = Rotation.random(random_state=1).as_matrix()
 
 
 def plane_scene() -> Scene:
@@ -56,7 +53,7 @@ def plane_scene() -> Scene:
 
 
 def sphere_scene() -> Scene:
-    return Scene((Body(Sphere(0.12), reflectance=0.4, poses=rigid(turned(1), (0.45, 0.01, 0.02))),), "sphere")
+    return Scene((Body(Sphere(0.12), reflectance=0.4, poses=rigid(TURNED, (0.45, 0.01, 0.02))),), "sphere")
 
 
 @lru_cache(maxsize=1)
@@ -147,7 +144,7 @@ def test_the_transient_of_a_whole_view_has_the_same_peak_and_energy(name, emitte
 @pytest.mark.parametrize("offset_m", [0.0, 1e5])
 def test_every_shape_is_exported_where_it_is(shape, offset_m):
     place = np.array([1.5 + offset_m, 0.2, 0.1])
-    scene = Scene((Body(shape, reflectance=0.6, poses=rigid(turned(2), place)),))
+    scene = Scene((Body(shape, reflectance=0.6, poses=rigid(TURNED, place)),))
     rays = rays_from((offset_m, 0.0, 0.0), spiral(500, 0.3), far_m=100.0)
     echoes = single_bounces(scene, rays)
     found = render_transient(scene, 0, rays, flood(rays.origin_m[:1]), PathBins(0.01, 1))
@@ -158,7 +155,7 @@ def test_every_shape_is_exported_where_it_is(shape, offset_m):
 @needs_simulator
 @pytest.mark.parametrize("shape", [Cylinder(0.2, 0.25), Ellipsoid((0.2, 0.3, 0.25))], ids=repr)
 def test_shapes_that_the_renderer_takes_as_meshes_send_back_as_much_light(shape):
-    scene = Scene((Body(shape, poses=rigid(turned(2), (1.5, 0.2, 0.1))),))
+    scene = Scene((Body(shape, poses=rigid(TURNED, (1.5, 0.2, 0.1))),))
     rays = rays_from((0.0, 0.0, 0.0), spiral(500, 0.3), far_m=100.0)
     echoes = single_bounces(scene, rays)
     found = render_transient(scene, 0, rays, flood(rays.origin_m[:1]), PathBins(0.01, 1)).steady

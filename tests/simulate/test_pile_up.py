@@ -173,9 +173,3 @@ def test_an_echo_that_blinds_one_ray_changes_no_other():
 
 def test_a_detector_without_dead_time_counts_everything():
     assert np.array_equal(even_light(0.5, dead_bins=0), seen(0.5, {"ambient"}))
-
-
-def test_pile_up_only_takes_photons_away():
-    counts, arrived = even_light(0.05, dead_bins=5), seen(0.05, {"ambient"})
-    assert (counts <= arrived).all()
-    assert counts.sum() < arrived.sum()

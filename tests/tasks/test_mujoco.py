@@ -442,11 +442,7 @@ REAL = {
         "targets": ("toe*",), "mount_body": "torso", "origin_m": (0.0, 0.0, -0.25), "metric": "seen",
     }),
     "a quadruped with a height field": ("dm_control", "suite/quadruped.xml", "", {"targets": ("terrain",)}),
-    "a humanoid": ("dm_control", "suite/humanoid.xml", "", {"targets": ("*hand",), "metric": "surface"}),
     "a hand of meshes": ("gymnasium_robotics", f"{ASSETS}/hand/reach.xml", ASSETS, {"targets": ("*ffdistal",)}),
-    "an arm with a gripper": ("gymnasium_robotics", f"{ASSETS}/fetch/pick_and_place.xml", ASSETS, {
-        "targets": ("*finger_link",),
-    }),
     "an arm with seven joints": ("robosuite", "models/assets/robots/panda/robot.xml", "", {
         "targets": ("link7",), "groups": (1,),
     }),
