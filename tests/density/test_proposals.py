@@ -135,11 +135,6 @@ def test_moving_bodies_are_proposed_in_all_their_frames():
         assert (np.sign(proposals.points[proposals.column == column, AZIMUTH]) == side).all()
 
 
-def test_a_space_that_sees_nothing_gets_no_proposals():
-    away = DesignSpace((0, 0, 0, 2.0, -0.1, 0.5), (0, 0, 0, 3.0, 0.1, 1.0))
-    assert len(drawn([BALL], away, 500).points) == 0
-
-
 @pytest.mark.parametrize("role", ["occluder", "target", "both"])
 def test_the_occluded_share_counts_occluders_in_front_and_nothing_else(role):
     plate = Body(Box((0.005, 1.0, 1.0)), "plate", role, rigid(translation_m=(1.0, 0, 0)))
