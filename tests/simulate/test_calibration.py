@@ -25,7 +25,7 @@ from lidardesign.simulate.detector.physics import IDEAL, Physics
 from lidardesign.simulate.returns import simulate
 
 ZONES = load_detector("consumer-8x8")
-REPEATS = 24
+REPEATS = 12
 RANGER = """\
 schema_version: 1
 maker: Example

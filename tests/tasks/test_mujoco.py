@@ -90,7 +90,7 @@ def write_csv(path, table):
     ],
 )
 def test_the_task_keeps_the_contract(folder, keys):
-    usual = [f"model={folder / 'robot.xml'}", "train=3", "test=3", "frames=6"]
+    usual = [f"model={folder / 'robot.xml'}", "train=2", "test=2", "frames=4"]
     targets = [] if "targets" in keys else ["targets=[hand]"]
     found = contract_of(TASK, overrides=[*usual, *targets, *keys.split()])
     # in another process they are made again by the tests of workers

@@ -125,9 +125,9 @@ def test_what_cannot_be_dropped_or_does_not_come_to_rest_is_one_message():
     with pytest.raises(DataError, match="flat"):
         background_of("bin", [flat], 1)
     box = mesh(SHAPES["box"])
-    low = replace(background_of("bin", [box], 8), highest_m=1e-3)
+    low = replace(background_of("bin", [box], 2), highest_m=1e-3)
     with pytest.raises(DataError, match=f"{ATTEMPTS} attempts"):
-        settled_poses((box,) * 8, low, 0)
+        settled_poses((box,) * 2, low, 0)
 
 
 @pytest.fixture(scope="module")
@@ -141,7 +141,7 @@ def folder(tmp_path_factory):
 @each_kind
 def test_random_rays_score_alike_with_and_without_the_background(folder, kind):
     task = MeshesTask()
-    config = task.Config(folder=folder, clutter=8, background=kind, poses=2, truth_points=1500)
+    config = task.Config(folder=folder, clutter=8, background=kind, poses=1, truth_points=1500)
     space = task.space(config)
     with_it, without, taken_for_it = [], [], []
     for scene in task.scenes(config, "test", 0, space):
@@ -174,7 +174,7 @@ def test_returns_on_the_background_tell_nothing_and_spoil_nothing(folder):
 def test_a_pile_shows_the_mesh_of_its_scene_and_others_of_its_split_alone(folder):
     task = MeshesTask()
     for count in (1, 2, 7):
-        config = task.Config(folder=folder, clutter=count, poses=2, truth_points=100)
+        config = task.Config(folder=folder, clutter=count, poses=1, truth_points=100)
         shown = {}
         for split in ("train", "test"):
             for scene in task.scenes(config, split, 0):
