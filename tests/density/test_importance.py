@@ -14,6 +14,7 @@ from lidardesign.density.fields.importance import (
     BodyWeights,
     TableWeights,
     UnionWeights,
+    importance_notes,
     is_weighted,
 )
 from lidardesign.density.objective.proposals import independent_points
@@ -101,6 +102,7 @@ def built(make, visibility, shape, factor=1.0):
 def test_weights_of_one_are_none():
     ones = ball(lambda vertices: np.ones(len(vertices)))
     assert all(built(make, "off", ones).surfaces.importance is None for make in (at_rest, moving, mixed))
+    assert importance_notes(at_rest(ones)) == []
 
 
 # a primitive has no vertices
@@ -279,6 +281,7 @@ def test_a_patch_that_counts_three_times_has_three_times_the_mass():
     share = density[left].sum() / density.sum()
     error = np.sqrt(np.square(density * (left - share)).sum()) / density.sum()
     assert abs(share - 0.75) < 4 * error < 0.02
+    assert "from 1 to 3" in importance_notes([scene])[0]
 
 
 def test_settings_that_only_weigh_do_not_keep_designs_from_being_judged_together():

@@ -201,6 +201,8 @@ def test_the_spots_of_a_flood_light_each_other_as_two_small_surfaces_do():
     second = 0.2 * factor * 0.5**2 * (1.0 + apart_m - 0.5) / 2
     found = sight(scene, replace(detector, bin_s=1e-8), rays)
     assert _moved_m(found, np.arange(2), np.arange(2)) == pytest.approx([first, second], rel=1e-6)
+    balls = tuple(Body(Sphere(0.1), poses=rigid(translation_m=place)) for place in ((1, 0.15, 0), (1.3, -0.15, 0)))
+    assert "spots of a flood" in bound("multipath", Scene(balls), CONSUMER, grid(24, 0.4)).reason
 
 
 def test_shares_of_light_that_leads_elsewhere_are_counted():

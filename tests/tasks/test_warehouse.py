@@ -276,6 +276,7 @@ def test_a_robot_that_stands_still_is_judged_where_it_stands():
         {"box_setback_m": (0.0, 0.5)},
         {"level_spacing_m": (0.3, 0.5)},
         {"front_m": (0.1, 1.0)},
+        {"front_m": (0.5, 3.0)},
     ],
 )
 def test_shelves_that_cannot_stand_are_refused(values):
