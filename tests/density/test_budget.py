@@ -94,11 +94,11 @@ def test_a_run_that_was_killed_after_it_stopped_takes_no_further_step(good_enoug
 
 
 def test_time_decides_only_after_as_many_balancing_steps_as_path_wise_ones(tmp_path):
-    assert learn(BallTask(), config_of(), tmp_path, is_over=lambda _: True).steps == 100
+    assert learned(tmp_path, is_over=lambda _: True).steps == 40
 
 
 def test_a_run_whose_time_was_over_is_the_run_of_its_steps(tmp_path):
-    end = 53
+    end = 43
     result = learned(tmp_path / "run", is_over=is_over_at(end), steps=MOST_STEPS)
     plain = learned(tmp_path / "plain", steps=end)
     assert result.steps == plain.steps == end
@@ -114,7 +114,6 @@ def test_too_few_probes_stop_nothing(tmp_path, monkeypatch):
     config = config_of(**EARLY, misplaced=1.0, steps=60)
     data = prepare_training_data(BallTask(), config)
     few = IndependentProbes(*(values[:99] for values in vars(data.probes).values()))
-    assert learn(BallTask(), config, tmp_path).steps == 40
     monkeypatch.setattr(
         "lidardesign.density.training.learn.prepare_training_data", lambda *_: replace(data, probes=few)
     )

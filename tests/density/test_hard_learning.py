@@ -9,7 +9,7 @@ from support.learning import interrupt_after_a_checkpoint
 from lidardesign.density.training import quality
 
 SETTINGS = (
-    "size=small", "train=2", "test=1", "frames=6", "learning.steps=40", "learning.batch=64", "learning.samples=1000",
+    "size=small", "train=2", "test=1", "frames=6", "learning.steps=30", "learning.batch=64", "learning.samples=1000",
     "learning.coverage_proposals=256", "learning.balance_proposals=256", "learning.checkpoint_seconds=0.001",
     "learning.frames=3",
 )  # fmt: skip

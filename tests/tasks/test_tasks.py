@@ -41,7 +41,7 @@ CASES = {
     "flatland occluded": (FlatlandTask, {"train": 3, "test": 2, "scene": "occluded"}),
     "face embedded": (FaceTask, SMALL),
     "face with a free origin": (FaceTask, {**SMALL, "origin_box_m": 0.05}),
-    "face of the real model": (FaceTask, {**SMALL, "model": str(REAL_MODEL)}),
+    "face of the real model": (FaceTask, {**SMALL, "train": 1, "test": 1, "model": str(REAL_MODEL)}),
     "emitter": (EmitterTask, SMALL),
     "meshes": (MeshesTask, {"folder": "three", "truth_points": 800, "poses": 2}),
     "one mesh": (MeshesTask, {"folder": "one", "truth_points": 800, "poses": 2}),
