@@ -26,7 +26,6 @@ COSINE = (1.0, -1 / 2, 1 / 24, -1 / 720)
 # Guards, from the finest to the coarsest. Modules rename them where another name is clearer.
 # The smallest normal float64: a quotient by at least this is finite for numerators of up to about 1.
 TINY = float(np.finfo(np.float64).tiny)
-TINY_FLOAT32 = float(np.finfo(np.float32).tiny)
 # Squares of numbers below this underflow.
 SQUARABLE = 1e-150
 # Relative spacing of float64 and of float32 near 1, and an upper bound of rounding to float32, which is half of that.

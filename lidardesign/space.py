@@ -168,12 +168,6 @@ class DesignSpace:
             bounds[ELEVATION] = np.sin(bounds[ELEVATION])
         return bounds
 
-    @property
-    def log_volume(self) -> float:
-        """Logarithm of the chart volume of the free dimensions."""
-        free = list(self.free)
-        return float(np.log(self.chart_high[free] - self.chart_low[free]).sum())
-
     def to_chart(self, points: np.ndarray) -> np.ndarray:
         """Chart coordinates of design points, (..., 6) to (..., 6), with the azimuth wrapped into the bounds."""
         chart = self.wrap(points)

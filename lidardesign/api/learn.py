@@ -161,7 +161,9 @@ class LearnRequest:
             settings = _with_inputs(resolve(plugin, **choices))
         request = cls(plugin, folder, settings, options, begun, replaces)
         if replaces:
-            notes(f"once it is learned it replaces the run {folder}{request._lost_designs()}")
+            designs = ", ".join(sorted(path.stem for path in (folder / DESIGN_FOLDER).glob("*.yaml")))
+            lost = f", with its designs ({designs})" if designs else ""
+            notes(f"once it is learned it replaces the run {folder}{lost}")
         for line in RunFolder(place, plugin, settings).input_notes() if begun else ():
             notes(line)
         if begun and not request.has_checkpoint:
@@ -172,11 +174,6 @@ class LearnRequest:
     def place(self) -> Path:
         """The folder to learn in: beside the run's own while that holds the run to be replaced."""
         return next_to(self.folder, NEW) if self.replaces else self.folder
-
-    def _lost_designs(self) -> str:
-        """The designs that replacing the run deletes, in words; empty where there are none."""
-        designs = ", ".join(sorted(path.stem for path in (self.folder / DESIGN_FOLDER).glob("*.yaml")))
-        return f", with its designs ({designs})" if designs else ""
 
     @property
     def has_checkpoint(self) -> bool:

@@ -154,14 +154,6 @@ def _print_version(wanted: bool) -> None:
         raise typer.Exit
 
 
-def _print_versions() -> int:
-    """Answer `--version --json`: the versions of all that a result depends on."""
-    from lidardesign.run.manifest import versions
-
-    print_json({"version": __version__, "versions": versions()})
-    return 0
-
-
 @app.callback()
 def program(
     version: Annotated[
@@ -199,7 +191,11 @@ def _invoke(arguments: list[str]) -> int:
     """Run typer without letting it print or exit for errors."""
     output = Output(json="--json" in arguments)
     if sorted(arguments) == ["--json", "--version"]:
-        return _print_versions()
+        # the versions of all that a result depends on
+        from lidardesign.run.manifest import versions
+
+        print_json({"version": __version__, "versions": versions()})
+        return 0
     try:
         code: Any = app(arguments, prog_name=PROGRAM, standalone_mode=False)
     except typer.Exit as error:

@@ -150,7 +150,9 @@ def _statements() -> list[tuple[str, str, str]]:
 
 def answer_check(request: dict[str, Any], result: BinaryIO) -> dict[str, Any]:
     """In the child: try all laws and write their findings."""
-    _settle(request)
+    # temporary files and bytecode of the plugin stay out of its folder
+    tempfile.tempdir = os.environ["TMPDIR"] = tempfile.mkdtemp(dir=request["folder"])
+    os.environ["PYTHONDONTWRITEBYTECODE"], sys.dont_write_bytecode = "1", True
     contract = _begin(request, result)
     if contract is None:
         return {}
@@ -158,12 +160,6 @@ def answer_check(request: dict[str, Any], result: BinaryIO) -> dict[str, Any]:
     for finding in contract.findings():
         write_line(result, finding.as_dict())
     return {}
-
-
-def _settle(request: dict[str, Any]) -> None:
-    """Set a folder for temporary files, and keep Python from writing bytecode next to the plugin's sources."""
-    tempfile.tempdir = os.environ["TMPDIR"] = tempfile.mkdtemp(dir=request["folder"])
-    os.environ["PYTHONDONTWRITEBYTECODE"], sys.dont_write_bytecode = "1", True
 
 
 def _begin(request: dict[str, Any], result: BinaryIO) -> Contract | None:

@@ -263,7 +263,18 @@ class Fitter:
         if request.constraints.parts is not None:
             return self._parts(request, self.notes)
         if request.layout == "spinning":
-            return self._rings()
+            from lidardesign.fitting.spinning import CHANNELS, choose_rings
+
+            return choose_rings(
+                self.samples,
+                request.constraints,
+                count=request.sensors or 1,
+                channels=CHANNELS if request.channels is None else request.channels,
+                rays=request.rays,
+                informs=partial(checked_information, request.run.task),
+                scenes=self.training.scenes,
+                name=request.name,
+            )
         if request.sensors == BEST:
             return self._without_idle(self._best_count())
         return self._fitted(request)
@@ -452,21 +463,6 @@ class Fitter:
         from lidardesign.fitting.part_design import choose_parts
 
         return choose_parts(self.samples, request, self.training, notes, self.progress)
-
-    def _rings(self) -> FitResult:
-        from lidardesign.fitting.spinning import CHANNELS, choose_rings
-
-        request = self.request
-        return choose_rings(
-            self.samples,
-            request.constraints,
-            count=request.sensors or 1,
-            channels=CHANNELS if request.channels is None else request.channels,
-            rays=request.rays,
-            informs=partial(checked_information, request.run.task),
-            scenes=self.training.scenes,
-            name=request.name,
-        )
 
 
 def twin_samples(run: RunFolder) -> Samples:

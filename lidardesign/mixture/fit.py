@@ -211,7 +211,10 @@ def _supports(
         if is_free:
             support = restrict_samples(samples, rules, group)
         else:
-            own = samples if shares is None else _shared(samples, shares[:, list(group.sensors)].sum(axis=1))
+            own = samples
+            if shares is not None:
+                share = shares[:, list(group.sensors)].sum(axis=1)
+                own = replace(samples, log_prob=samples.log_prob - np.log(np.maximum(share, TINY)))
             generator = random_generator(problem.seed, "pinned", index)
             support = pin_samples(own, rules, group, problem.retarget, problem.em_samples, generator)
         mass = support.total if is_free else None
@@ -221,11 +224,6 @@ def _supports(
             raise _too_few(group.sensors[0], count, support.effective)
         supports.append(replace(support, mass=mass))
     return supports
-
-
-def _shared(samples: Samples, share: np.ndarray) -> Samples:
-    """The samples with their weights multiplied by shares (N,)."""
-    return replace(samples, log_prob=samples.log_prob - np.log(np.maximum(share, TINY)))
 
 
 @phase("features")

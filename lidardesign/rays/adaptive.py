@@ -182,8 +182,12 @@ class PatternSearch:
         """
         has_looks = self.frames.features is None
         counts = dict.fromkeys(max(self.count // part, 1) for part in LOOKS) if has_looks else (0,)
-        looks, best = [self._look(count) for count in counts], None
-        for number in reversed(_numbers(min(most, len(self.frames)))):
+        none, best = np.full(len(self.gates_m), -1), None
+        # the gates of the candidates that look first: the best as if they were all
+        looks = [self._choose(self._whole, none, count) if count else none for count in counts]
+        most = min(most, len(self.frames))
+        # powers of two, and the largest
+        for number in sorted({*(2**power for power in range(1, most.bit_length())), most} - {0, 1}, reverse=True):
             progress(f"choosing {number} patterns")
             # the numbers of looking rays are compared at the largest number of patterns
             found = [self._divided(look, number) for look in (looks if best is None else [best.look])]
@@ -224,11 +228,6 @@ class PatternSearch:
             chosen = self._of(chosen.rule, chosen.look, chosen.members, tables, passes=1)
         self.price = price
         return best
-
-    def _look(self, looks: int) -> np.ndarray:
-        """The gates of the candidates that look first, (N,): the best as if they were all."""
-        none = np.full(len(self.gates_m), -1)
-        return self._choose(self._whole, none, looks) if looks else none
 
     @cached_property
     def _whole(self) -> Coverage:
@@ -319,11 +318,6 @@ class PatternSearch:
         if np.isinf(selection.limit_mbps):
             return choose(coverage, counts, price=self.price, passes=passes, kept=look).gate
         return choose_within(coverage, counts, share * selection.limit_mbps, passes=passes, kept=look).gate
-
-
-def _numbers(most: int) -> list[int]:
-    """Numbers of patterns that are tried, ascending: powers of two from 2, and the largest."""
-    return sorted({*(2**power for power in range(1, most.bit_length())), most} - {0, 1})
 
 
 @phase("what returns tell")

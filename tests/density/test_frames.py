@@ -7,11 +7,12 @@ import math
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 from support import references
 
 from lidardesign.config import DensitySettings
 from lidardesign.density.fields.bodies import Pairs, occluding_bodies
-from lidardesign.density.fields.distance import BodyField, build_field
+from lidardesign.density.fields.distance import build_field
 from lidardesign.density.objective.proposals import independent_points
 from lidardesign.density.objective.surfaces import MovingFrames
 from lidardesign.density.objective.target import build_target
@@ -29,22 +30,15 @@ ALL = SETTINGS.model_copy(update={"surface_tolerance_nats": 1e6})
 pytestmark = pytest.mark.usefixtures("own_cache")
 
 
-def turned(generator):
-    """A random rotation, shape (3, 3)."""
-    q, r = np.linalg.qr(generator.normal(size=(3, 3)))
-    q = q * np.sign(np.diag(r))
-    return q if np.linalg.det(q) > 0 else -q
-
-
 def tracks(generator, frames):
     """Poses that wander through the space below the ceiling, (frames, 4, 4)."""
     ends = generator.uniform([-0.4, -0.4, 0.1], [0.4, 0.4, 0.5], (2, 3))
     share = np.linspace(0, 1, frames)[:, None]
-    rotation = turned(generator)
+    rotation = Rotation.random(random_state=generator).as_matrix()
     return np.stack([rigid(rotation, place) for place in (1 - share) * ends[0] + share * ends[1]])
 
 
-def cube(generator):
+def cube():
     mesh = trimesh.creation.box((0.1, 0.14, 0.2))
     return Mesh(mesh.vertices, mesh.faces)
 
@@ -52,7 +46,7 @@ def cube(generator):
 def moving_scenes(seed=0, scenes=3, frames=7, with_mesh=True):
     """Balls carried under links of every kind."""
     generator = np.random.default_rng(seed)
-    mesh = cube(generator)
+    mesh = cube()
     result = []
     for index in range(scenes):
         path = tracks(generator, frames)
@@ -138,38 +132,6 @@ def test_parts_of_all_frames_average_to_the_whole():
     np.testing.assert_allclose(np.exp(parts).mean(axis=0), np.exp(target.log_density(points)), rtol=1e-9)
 
 
-def test_bodies_are_found_by_their_boxes_as_by_looking_at_all():
-    scenes = moving_scenes(frames=4)
-    bodies = build_field(scenes, lambda body: not isinstance(body.shape, Plane), resolution=24, padding_m=0.1).bodies
-    points = np.random.default_rng(5).uniform(-0.6, 0.8, (400, 3))
-    everything = BodyField(bodies).distances(points)
-    from lidardesign.density.objective.surfaces import near_pairs
-
-    pairs = near_pairs(bodies, points, np.zeros(bodies.columns), 0.05, 1e9)
-    np.testing.assert_array_equal(pairs.columns, np.tile(np.arange(bodies.columns), len(points)))
-    np.testing.assert_allclose(pairs.distances, everything.ravel(), atol=1e-12)
-
-
-@pytest.mark.parametrize("with_mesh", [False, True], ids=["primitives", "meshes"])
-def test_first_hits_of_pairs_are_those_of_the_scene(with_mesh):
-    scenes = moving_scenes(frames=3, with_mesh=with_mesh)
-    visibility = BodyRaycast(occluding_bodies(scenes))
-    generator = np.random.default_rng(7)
-    points = CEILING.sample(400, generator)
-    rays = RayBatch(points[:, :3].copy(), direction(points[:, AZIMUTH], points[:, ELEVATION]), points[:, 5].copy())
-    columns = 9
-    pairs = Pairs(np.arange(401) * columns, np.tile(np.arange(columns), 400), np.zeros(3600), np.zeros(3600, int))
-    limit = np.full(400, 1.4)
-    hits, normals = visibility.first_hits(rays, pairs, limit)
-    hits, normals = hits.reshape(400, columns), normals.reshape(400, columns, 3)
-    for column in range(columns):
-        one = SceneCaster(scenes[column // 3], column % 3, only="occluders").trace(rays.origins, rays.directions, limit)
-        np.testing.assert_allclose(hits[:, column], one.range_m, rtol=1e-5)
-        # embree's normals near an edge of the cube may be of either face
-        same = np.einsum("nk,nk->n", normals[:, column], one.normal) > 0.999
-        assert same[np.isfinite(one.range_m)].mean() > 0.98
-
-
 def first_hits_of_one_column(shapes_and_poses, origin, toward, limit_m=10.0):
     """Range and normal of a ray's first hit on occluders."""
     scene = Scene(tuple(Body(shape, f"body {n}", "both", pose) for n, (shape, pose) in enumerate(shapes_and_poses)))
@@ -180,7 +142,7 @@ def first_hits_of_one_column(shapes_and_poses, origin, toward, limit_m=10.0):
 
 
 def test_of_more_meshes_along_a_ray_than_there_is_room_for_the_nearest_is_met():
-    mesh = cube(None)
+    mesh = cube()
     row = [(mesh, rigid(translation_m=(0.5 * n, 0, 0))) for n in range(12, 0, -1)]
     range_m, normal = first_hits_of_one_column(row, (0, 0.01, 0.02), (1, 0, 0))
     assert range_m == pytest.approx(0.45, abs=1e-6)
@@ -231,7 +193,7 @@ def test_a_quadrature_over_thousands_of_bodies_is_refused():
 
 def test_a_frame_costs_a_pose_and_no_grid_even_where_scenes_have_copies_of_a_mesh():
     generator = np.random.default_rng(0)
-    scenes = [Scene((Body(cube(generator), "part", "target", tracks(generator, 250)),)) for _ in range(2)]
+    scenes = [Scene((Body(cube(), "part", "target", tracks(generator, 250)),)) for _ in range(2)]
     bodies = build_field(scenes, lambda body: True, resolution=16, padding_m=0.05).bodies
     assert bodies.columns == 500
     assert len(bodies.grids.meshes) == 1

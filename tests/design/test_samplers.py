@@ -16,6 +16,7 @@ from support.designs import sensor
 from support.flows import flow_of
 from support.mixtures import POINT, features_of, random_mixture
 from support.mixtures import drawn as drawn_from_mixture
+from support.spaces import log_volume
 
 from lidardesign.constraints.document import Constraints
 from lidardesign.density.coordinates import Coordinates
@@ -170,7 +171,7 @@ BOX = DesignSpace((-0.5, -0.4, 0, -1.5, -0.9, 0.2), (0.5, 0.4, 0, 1.5, 0.9, 3.0)
 def samples_of(log_p_star, space=BOX, count=400_000, seed=9):
     """Uniform samples weighted to p*: many more than are drawn of them, so that their own noise is little."""
     points = space.sample(count, np.random.default_rng(seed))
-    return Samples(points, np.full(count, -space.log_volume), log_p_star(points), space)
+    return Samples(points, np.full(count, -log_volume(space)), log_p_star(points), space)
 
 
 def bump(points):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import trimesh
 from support.triangles import naive_triangle_distance_m
 
 from lidardesign.scenes.distances import TriangleTree
@@ -34,15 +35,6 @@ def diagonal_segments():
     return lines[:, None] * np.round(generator(7).uniform(size=(160, 3, 1)), 2)
 
 
-def sheet():
-    """Triangles that share corners and edges, as those of a reconstruction do."""
-    steps = np.linspace(0, 1, 9)
-    x, y = (values.ravel() for values in np.meshgrid(steps, steps, indexing="ij"))
-    places = np.column_stack([x, y, 0.1 * np.sin(5 * x) * np.cos(4 * y)])
-    first = (np.arange(8)[:, None] * 9 + np.arange(8)).ravel()
-    return places[np.concatenate([first[:, None] + [0, 9, 1], first[:, None] + [10, 1, 9]])]
-
-
 SUBJECTS = {
     "one": corners(1),
     "two": corners(2),
@@ -50,7 +42,7 @@ SUBJECTS = {
     "small": corners(150, 1e-4),
     "smallest": corners(150, 1e-9),
     "huge and tiny": np.concatenate([corners(40, 10.0**power, seed=6 + power) for power in range(-6, 2)]),
-    "a sheet": sheet(),
+    "a ball": trimesh.creation.icosphere(2).triangles,  # of shared corners and edges
     "the same twice": np.repeat(corners(60, 0.2), 2, axis=0),
     "the same many times": np.repeat(corners(1), 100, axis=0),
     "points": np.repeat(generator(1).uniform(size=(100, 1, 3)), 3, axis=1),
@@ -128,10 +120,5 @@ def test_neither_the_order_of_triangles_corners_and_points_nor_rigid_motion_chan
     np.testing.assert_allclose(moved, found, rtol=0, atol=NANOMETRE)
 
 
-def test_no_point_has_no_distance_and_more_triangles_are_never_further():
-    triangles = SUBJECTS["many"]
-    points = places(triangles)
-    assert TriangleTree(triangles).distance_m(np.zeros((0, 3))).shape == (0,)
-    fewer, all_of_them = (TriangleTree(some).distance_m(points) for some in (triangles[:40], triangles))
-    assert (all_of_them <= fewer + NANOMETRE).all()
-    assert (all_of_them < fewer - NANOMETRE).any()
+def test_no_point_has_no_distance():
+    assert TriangleTree(SUBJECTS["many"]).distance_m(np.zeros((0, 3))).shape == (0,)

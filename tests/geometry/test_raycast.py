@@ -53,7 +53,7 @@ def test_primitives_are_hit_where_marching_along_their_distance_arrives(name):
     def world_distance(points):
         return distance((points - POSE[:3, 3]) @ POSE[:3, :3])
 
-    origins, directions = rays_towards(2000, 1)
+    origins, directions = rays_towards(800, 1, spread=0.4)
     outside = world_distance(origins) > 0
     origins, directions = origins[outside], directions[outside]
     marched = references.marched_hit(world_distance, origins, directions, 1e4)
@@ -83,31 +83,6 @@ def test_normals_are_the_gradient_of_the_distance_and_face_the_ray(name):
     assert (np.einsum("nk,nk->n", hits.normal[hit], directions[hit]) <= 0).all()
     assert (hits.normal[~hit] == 0).all()
     assert (hits.body[~hit] == -1).all()
-
-
-TESSELLATED = {
-    "sphere": (Sphere(0.7), lambda: trimesh.creation.icosphere(subdivisions=5, radius=0.7)),
-    "box": (Box((0.3, 0.5, 0.9)), lambda: trimesh.creation.box((0.6, 1.0, 1.8))),
-    "cylinder": (Cylinder(0.4, 0.8), lambda: trimesh.creation.cylinder(0.4, 1.6, sections=256)),
-    "ellipsoid": (
-        Ellipsoid((0.3, 0.5, 0.9)),
-        lambda: trimesh.creation.icosphere(subdivisions=5).apply_scale((0.3, 0.5, 0.9)),
-    ),
-}
-
-
-@pytest.mark.parametrize("name", TESSELLATED)
-def test_primitives_and_their_tessellations_are_hit_at_the_same_range(name):
-    shape, tessellation = TESSELLATED[name]
-    origins, directions = rays_towards(3000, 3, spread=0.3)
-    exact = SceneCaster(Scene((Body(shape),))).first_hit(origins, directions)
-    mesh = SceneCaster(Scene((Body(solid_mesh(tessellation())),))).first_hit(origins, directions)
-    both = np.isfinite(exact.range_m) & np.isfinite(mesh.range_m)
-    assert both.sum() > 1000
-    steep = both & (np.abs(np.einsum("nk,nk->n", exact.normal, directions)) > 0.5)
-    faceting = 0.0 if name == "box" else 4e-4
-    difference = np.abs(exact.range_m[steep] - mesh.range_m[steep])
-    assert difference.max() < 2 * (faceting + references.EMBREE_M)
 
 
 @pytest.mark.parametrize("name", SOLIDS)
@@ -148,11 +123,6 @@ def test_no_ray_slips_through_the_seam_between_a_capsules_side_and_its_caps():
     directions = (seam - origins)[ahead]
     hits = SceneCaster(Scene((Body(capsule),))).first_hit(origins[ahead], directions)
     np.testing.assert_allclose(hits.range_m, np.linalg.norm(directions, axis=1), atol=1e-9)
-
-
-def test_no_rays_have_no_hits():
-    for shape in (Sphere(1.0), solid_mesh(trimesh.creation.box((1, 1, 1)))):
-        assert SceneCaster(Scene((Body(shape),))).first_hit(np.zeros((0, 3)), np.zeros((0, 3))).range_m.shape == (0,)
 
 
 def mixed_scene(shift=(0.0, 0.0, 0.0)):
@@ -210,18 +180,6 @@ def test_chunks_of_rays_do_not_change_the_bits():
     parts = [caster.first_hit(origins[rows], directions[rows]) for rows in chunks]
     for name in ("range_m", "body", "normal"):
         assert getattr(whole, name).tobytes() == np.concatenate([getattr(part, name) for part in parts]).tobytes()
-
-
-def test_a_scene_far_from_the_origin_is_hit_as_precisely():
-    shift = np.array([1e5, -2e5, 3e4])
-    origins, directions = rays_towards(1000, 12)
-    near = SceneCaster(mixed_scene()).first_hit(origins, directions)
-    far = SceneCaster(mixed_scene(shift)).first_hit(origins + shift, directions)
-    same = near.body == far.body
-    assert same.mean() > 0.999
-    hit = same & (near.body >= 0) & (np.abs(np.einsum("nk,nk->n", near.normal, directions)) > 0.1)
-    # positions of 2e5 m carry 3e-11 m of rounding in float64, Embree's own rounding comes on top
-    np.testing.assert_allclose(far.range_m[hit], near.range_m[hit], atol=10 * references.EMBREE_M)
 
 
 def test_rays_that_start_far_away_are_advanced_before_float32():
@@ -391,7 +349,3 @@ def test_scenes_of_the_same_bodies_share_what_is_built_of_their_meshes_and_other
     resting = [SceneCaster(scene).at_rest for scene in (first, second, alone)]
     assert resting[0] is resting[1]
     assert resting[2] is not resting[0]
-    turned = Scene(tuple(balls[::-1]), "turned")
-    ray = np.zeros((1, 3)), np.array([[1.0, 0, 0]])
-    assert SceneCaster(first).first_hit(*ray).body[0] == 0
-    assert SceneCaster(turned).first_hit(*ray).body[0] == 1

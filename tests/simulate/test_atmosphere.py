@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,8 +17,6 @@ from lidardesign.scenes.scene import Body, Box, Medium, Receiver, Scene, rigid
 from lidardesign.simulate.detector.light import Background, Beams, direct_echoes
 from lidardesign.simulate.detector.physics import IDEAL, Detector, Photons
 from lidardesign.simulate.effects.atmosphere import through_air
-from lidardesign.simulate.effects.expected_counts import haze_per_pulse
-from lidardesign.simulate.effects.first_hits import FirstHits
 from lidardesign.simulate.effects.footprint import split_beams
 
 PHOTONS = Photons(905e-9, 1e-6, 1e4, "scanned", 1e6, 1e-6, 1e-4, 0.2, 1e-9, 1e3, 0.0)
@@ -46,13 +43,6 @@ def integral(low_m, high_m, medium=FOG):
         return -math.exp(-rate * r) / r + rate * exp1(rate * r)
 
     return primitive(high_m) - primitive(low_m)
-
-
-def test_clear_air_leaves_echoes_and_background_the_same_objects():
-    scene = Scene((WALL,))
-    echoes, faded, background = in_air(scene, rays_along([[1.0, 0, 0]], GATE_M))
-    assert faded is echoes
-    assert background.edges_m is None
 
 
 def test_light_fades_over_its_way_out_and_back():
@@ -146,19 +136,3 @@ def test_a_rays_haze_depends_on_no_other_ray_but_for_the_shared_energy():
     _, _, alone = in_air(Scene((WALL,), medium=FOG), many.subset(np.array([1])))
     assert np.array_equal(together.edges_m[1], alone.edges_m[0])
     assert np.array_equal(together.counts[1], alone.counts[0])
-
-
-@pytest.mark.parametrize("gate", [(0.0, 8.0), (0.05, 3.0), (0.5, 8.0), (4.0, 4.5)])
-@pytest.mark.parametrize("pixel_sr", [1e-7, 1e-4, 1.0])
-def test_the_planner_bounds_the_haze_that_is_counted(gate, pixel_sr):
-    detector = replace(COUNTING, photons=replace(PHOTONS, field_of_view_sr=pixel_sr))
-    scene, rays = Scene((WALL,), medium=FOG), rays_along([[1.0, 0, 0], [0.8, 0.6, 0], [-1.0, 0, 0]], gate)
-    _, _, background = in_air(scene, rays, detector)
-    sight = FirstHits.of(scene, 0, detector, [rays], SceneCaster(scene))
-    whole, fullest = haze_per_pulse(sight, np.full(3, PHOTONS.emitted(3)), 0.01)
-    assert (background.counts.sum(axis=1) <= whole * (1 + 1e-6)).all()
-    # all but what fades within the window
-    faded = np.exp(-0.6 * (np.minimum(gate[1], [5.0, 6.25, 8.0]) - gate[0]))
-    assert (background.counts.sum(axis=1) >= whole * faded * (1 - 2e-3)).all()
-    density = background.counts / np.diff(background.edges_m)
-    assert (density.max(axis=1) * 0.01 * (1 - 1e-9) <= fullest).all() or (fullest == whole).all()

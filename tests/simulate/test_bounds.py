@@ -7,9 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import trimesh
 from scipy.spatial.transform import Rotation
-from scipy.stats import norm, poisson
+from scipy.stats import poisson
+from soak.promise import random_case
+from support.meshes import icosphere
 from support.planning import (
     CONSUMER,
     SIMULATED,
@@ -20,7 +21,6 @@ from support.planning import (
     errors,
     facing_wall,
     grid,
-    random_shapes,
     room,
     sight,
 )
@@ -35,7 +35,6 @@ from lidardesign.scenes.scene import (
     Cylinder,
     Ellipsoid,
     Medium,
-    Mesh,
     Plane,
     Receiver,
     Scene,
@@ -45,15 +44,12 @@ from lidardesign.scenes.scene import (
 from lidardesign.simulate.detector.physics import Physics, metres
 from lidardesign.simulate.effects.expected_counts import (
     Blindness,
-    missed_behind,
     needed_counts,
-    share_in_bins,
-    unevenness,
 )
 from lidardesign.simulate.effects.first_hits import FirstHits, edge_probability
-from lidardesign.simulate.effects.motion import entered_rays, moving_tracer, point_velocities
+from lidardesign.simulate.effects.motion import entered_rays, moving_tracer
 from lidardesign.simulate.effects.multipath import _detours, _moved_m
-from lidardesign.simulate.plan import Planner, Tolerance
+from lidardesign.simulate.plan import Planner
 from lidardesign.simulate.returns import followed_light, photon_histograms, simulate
 
 
@@ -61,16 +57,7 @@ def bound(name, scene, detector, rays=None):
     return decisions(Planner(detector).plan(scene, [grid() if rays is None else rays]))[name].bound
 
 
-def box_mesh():
-    made = trimesh.creation.box((0.2, 0.1, 0.3))
-    return Mesh(np.array(made.vertices) + 0.05, np.array(made.faces))
-
-
 NARROW = grid(side=4, half_rad=1e-4)
-
-
-def test_rounding_is_off_by_a_bin_over_the_root_of_twelve():
-    assert bound("quantisation", room(), CONSUMER).range_m == pytest.approx(CONSUMER.bin_m / math.sqrt(12))
 
 
 def test_one_time_per_return_strays_by_the_whole_jitter():
@@ -106,14 +93,6 @@ def test_a_return_needs_the_fewest_counts_that_background_rarely_reaches(mean, b
     assert needed == 1 or bins * poisson.sf(needed - 2, mean) * rounding > allowed
 
 
-def test_a_bin_holds_its_share_of_an_echo_on_its_edge():
-    bin_m, sigma_s = 0.01, 2e-11
-    assert share_in_bins(1, bin_m, metres(sigma_s)) == pytest.approx(norm.cdf(bin_m / metres(sigma_s)) - 0.5)
-    three = norm.cdf(2 * bin_m / metres(sigma_s)) - norm.cdf(-bin_m / metres(sigma_s))
-    assert share_in_bins(3, bin_m, metres(sigma_s)) == pytest.approx(three)
-    assert (share_in_bins(1, bin_m, 0.0), share_in_bins(3, bin_m, 0.0)) == (0.5, 1.0)
-
-
 @pytest.mark.parametrize("signal", [0.0, 3.0, 20.0, 80.0])
 @pytest.mark.parametrize("level", [0.01, 0.5, 4.0])
 def test_the_union_over_bins_bounds_how_often_another_bin_wins(signal, level):
@@ -128,29 +107,21 @@ def test_the_union_over_bins_bounds_how_often_another_bin_wins(signal, level):
     assert wrong - 4 * math.sqrt(wrong * (1 - wrong) / draws) <= bounded <= 1
 
 
-@pytest.mark.parametrize("estimator", ["peak", "matched"])
-@pytest.mark.parametrize("signal", [1, 4, 30, 300, 2000])
-@pytest.mark.parametrize("bins_per_sigma", [0.3, 1.0, 4.0])
-def test_estimated_ranges_stray_no_further_than_bounded(estimator, signal, bins_per_sigma):
-    """The highest bin and the mean of n photons, drawn 2000 times, after rounding is taken off."""
-    sigma_m, draws, generator = metres(5e-11), 2000, np.random.default_rng(5)
-    bin_m = sigma_m / bins_per_sigma
-    bin_s = 2 * bin_m / 299792458
-    detector = replace(SINGLE, estimator=estimator, pulse_sigma_s=5e-11, jitter_sigma_s=0.0, bin_s=bin_s)
-    bounded = float(counts(facing_wall(), detector, NARROW).error_m(np.array([float(signal)]), sigma_m)[0])
-    photons = sigma_m * generator.normal(size=(draws, signal))
-    if estimator == "matched":
-        strayed = photons.mean(axis=1)
-    else:
-        edges = bin_m * (np.arange(-40, 41) + 0.5) if bins_per_sigma < 2 else bin_m * (np.arange(-80, 81) + 0.5)
-        heights = np.stack([np.histogram(row, edges)[0] for row in photons])
-        strayed = ((edges[1:] + edges[:-1]) / 2)[heights.argmax(axis=1)]
-    rms = float(np.sqrt(np.mean(strayed**2)))
-    rounding = bin_m / math.sqrt(12) if estimator == "peak" else 0.0
-    assert rms * (1 - 4 / math.sqrt(2 * draws)) <= bounded + rounding
+SUNNY = [room(ambient=Ambient(lux)) for lux in (0.0, 1.0, 30.0, 1e3, 1e4, 1e5)]
+DEAD = [replace(SINGLE, photons=replace(SINGLE.photons, dead_s=dead_s)) for dead_s in (0.0, 7.7e-8, 1e-6)]
+GROWING = {
+    "light of the surroundings": ("ambient", [(scene, SINGLE) for scene in SUNNY]),
+    "dead time in light": ("pile_up", [(SUNNY[-1], detector) for detector in DEAD]),
+    "fog": ("atmosphere", [(room(medium=Medium(a, a / 20)), SINGLE) for a in (0.0, 1e-4, 1e-2, 0.1, 1.0)]),
+    "the width of beams": ("footprint", [(room(), replace(CONSUMER, divergence_rad=w)) for w in (1e-3, 0.01, 0.2)]),
+    "speed": ("motion", [(room(ball={"velocity_m_s": (0.0, v, 0.0)}), TIMED) for v in (0.0, 0.01, 0.1, 1.0, 10.0)]),
+    "jitter": ("jitter", [(room(), replace(TIMED, jitter_sigma_s=sigma)) for sigma in (0.0, 1e-12, 1e-10)]),
+    "bins": ("quantisation", [(room(), replace(TIMED, bin_s=width)) for width in (1e-12, 1e-10, 1e-9)]),
+}
 
 
-def growing(name, cases):
+@pytest.mark.parametrize(("name", "cases"), GROWING.values(), ids=GROWING)
+def test_bounds_grow_with_what_causes_them(name, cases):
     found = [bound(name, *case) for case in cases]
     ranges, lost = [one.range_m for one in found], [one.lost for one in found]
     assert ranges == sorted(ranges)
@@ -158,33 +129,10 @@ def growing(name, cases):
     assert ranges[0] < ranges[-1] or lost[0] < lost[-1]
 
 
-def test_bounds_grow_with_the_light_of_the_surroundings():
-    scenes = [room(ambient=Ambient(lux)) for lux in (0.0, 1.0, 30.0, 1e3, 1e4, 1e5)]
-    growing("ambient", [(scene, SINGLE) for scene in scenes])
-    early_m = [bound("pile_up", scene, SINGLE).range_m for scene in scenes]
+def test_light_of_the_surroundings_makes_blind_detectors_early():
+    early_m = [bound("pile_up", scene, SINGLE).range_m for scene in SUNNY]
     assert early_m == sorted(early_m)
     assert early_m[-1] > 10 * early_m[0]
-
-
-def test_bounds_grow_with_the_width_of_beams():
-    growing("footprint", [(room(), replace(CONSUMER, divergence_rad=width)) for width in (0.001, 0.01, 0.05, 0.2)])
-
-
-def test_bounds_grow_with_speed():
-    speeds = (0.0, 0.01, 0.1, 1.0, 10.0)
-    growing("motion", [(room(ball={"velocity_m_s": (0.0, speed, 0.0)}), TIMED) for speed in speeds])
-
-
-def test_bounds_grow_with_fog():
-    growing("atmosphere", [(room(medium=Medium(a, a / 20)), SINGLE) for a in (0.0, 1e-4, 1e-2, 0.1, 1.0)])
-
-
-def test_bounds_grow_with_jitter_bins_and_dead_time():
-    growing("jitter", [(room(), replace(TIMED, jitter_sigma_s=sigma)) for sigma in (0.0, 1e-12, 1e-10)])
-    growing("quantisation", [(room(), replace(TIMED, bin_s=width)) for width in (1e-12, 1e-10, 1e-9)])
-    sunny = room(ambient=Ambient(1e5))
-    dead = [replace(SINGLE, photons=replace(SINGLE.photons, dead_s=dead_s)) for dead_s in (0.0, 7.7e-8, 1e-6)]
-    growing("pile_up", [(sunny, detector) for detector in dead])
 
 
 @pytest.mark.parametrize("tilt_deg", [0, 30, 60, 80, 88])
@@ -212,22 +160,6 @@ def test_the_share_of_beams_on_a_depth_edge_is_that_of_drawn_edges():
     error = np.std(np.array(found) - np.array(true)) / math.sqrt(40)
     assert np.mean(found) >= np.mean(true) - 4 * error
     assert np.mean(found) <= 4 * np.mean(true) + 4 * error
-
-
-def test_points_of_moving_bodies_move_with_them():
-    angle, rate = 0.01, 20.0
-    turned = rigid(np.array([[math.cos(angle), -math.sin(angle), 0], [math.sin(angle), math.cos(angle), 0], [0, 0, 1]]))
-    place = rigid(translation_m=(1.0, 0, 0))
-    ball = Body(Sphere(0.3), poses=np.stack([place, turned @ place, turned @ turned @ place]))
-    scene = Scene((ball,), frame_rate_hz=rate)
-    for frame in (0, 1, 2):
-        seen = sight(scene, TIMED, frame=frame)
-        points = seen.rays.origin_m + seen.range_m[:, None] * seen.rays.direction
-        met = seen.hits.body == 0
-        speed = np.linalg.norm(point_velocities(seen), axis=1)
-        expected = angle * rate * np.hypot(points[met, 0], points[met, 1])
-        assert speed[met] == pytest.approx(expected, rel=1e-4)
-        assert not speed[~met].any()
 
 
 def test_a_receiver_loses_what_lies_outside_its_view_and_may_lose_all_it_does_not_share():
@@ -269,6 +201,8 @@ def test_the_spots_of_a_flood_light_each_other_as_two_small_surfaces_do():
     second = 0.2 * factor * 0.5**2 * (1.0 + apart_m - 0.5) / 2
     found = sight(scene, replace(detector, bin_s=1e-8), rays)
     assert _moved_m(found, np.arange(2), np.arange(2)) == pytest.approx([first, second], rel=1e-6)
+    balls = tuple(Body(Sphere(0.1), poses=rigid(translation_m=place)) for place in ((1, 0.15, 0), (1.3, -0.15, 0)))
+    assert "spots of a flood" in bound("multipath", Scene(balls), CONSUMER, grid(24, 0.4)).reason
 
 
 def test_shares_of_light_that_leads_elsewhere_are_counted():
@@ -295,7 +229,7 @@ MOVERS = {
     "cylinder": Cylinder(0.05, 0.1),
     "ellipsoid": Ellipsoid((0.1, 0.05, 0.2)),
     "plane": Plane(),
-    "mesh": box_mesh(),
+    "mesh": icosphere(0.1, (0.05, 0.05, 0.05), subdivisions=2),
 }
 
 
@@ -317,11 +251,11 @@ def test_what_flies_into_view_calls_for_motion(shape):
     assert "motion" in Planner(TIMED).plan(scene, [rays]).effects
 
 
-@pytest.mark.parametrize("place", [(4.8, 0, 0.3), (2, 0.01, 0), (0, 0, 0), (-1, 0.5, 0.2), (5, 1, 0)])
-@pytest.mark.parametrize("gate_m", [(0.1, 6.5), (2.5, 3.0)])
-def test_haze_beside_a_fixed_receiver_is_bounded(place, gate_m):
+@pytest.mark.parametrize("place", [None, (4.8, 0, 0.3), (2, 0.01, 0), (0, 0, 0), (-1, 0.5, 0.2), (5, 1, 0)])
+@pytest.mark.parametrize("gate_m", [(0.0, 6.5), (0.1, 6.5), (2.5, 3.0)])
+def test_haze_is_bounded_also_beside_a_fixed_receiver(place, gate_m):
     """Against what the effect counts: all haze, and the fullest cell per length."""
-    receiver = Receiver(place, 0.0, 0.0, 3.1, 3.1, (0.0, 20.0))
+    receiver = None if place is None else Receiver(place, 0.0, 0.0, 3.1, 3.1, (0.0, 20.0))
     wall = Body(Box((0.05, 50, 50)), "wall", poses=rigid(translation_m=(6.05, 0, 0)))
     scene = Scene((wall,), medium=Medium(0.01, 0.02), receiver=receiver)
     rays = grid(side=8, half_rad=0.1, gate_m=gate_m)
@@ -340,66 +274,11 @@ def test_haze_beside_a_fixed_receiver_is_bounded(place, gate_m):
 STANDARD_ERRORS = 4.0
 
 
-def random_scene(generator):
-    bodies = []
-    for number in range(generator.integers(1, 4)):
-        shapes, place = random_shapes(generator)
-        speed = 10 ** generator.uniform(-3, 0.5) if generator.uniform() < 0.3 else 0.0
-        surface = {"velocity_m_s": tuple(speed * generator.normal(size=3))}
-        surface["reflectance"] = generator.uniform(0.05, 0.7)
-        if generator.uniform() < 0.1:
-            surface["specular"] = 0.3
-        shape = shapes[generator.integers(3)]
-        bodies.append(Body(shape, f"body {number}", poses=place, **surface))
-    if generator.uniform() < 0.7:
-        bodies.append(Body(Box((0.05, 3, 3)), "wall", poses=rigid(translation_m=(3, 0, 0))))
-    air = {}
-    if generator.uniform() < 0.6:
-        air["ambient"] = Ambient(10 ** generator.uniform(1, 5), str(generator.choice(["sun", "indoor"])))
-    if generator.uniform() < 0.4:
-        fog = 10 ** generator.uniform(-3, -0.3)
-        air["medium"] = Medium(fog, fog / 20 * 10 ** generator.uniform(-1, 0.5))
-    return Scene(tuple(bodies), f"scene {generator.integers(1 << 30)}", **air)
-
-
-def random_detector(generator):
-    chosen = (SINGLE, CONSUMER, TIMED)[generator.integers(3)]
-    if chosen is TIMED:
-        bin_s = None if generator.uniform() < 0.5 else 10 ** generator.uniform(-11, -9)
-        width = 10 ** generator.uniform(-3, -1)
-        pulse_s = float(generator.choice([0.0, 1e-10]))
-        return replace(TIMED, bin_s=bin_s, divergence_rad=width, footprint_rays=19, pulse_sigma_s=pulse_s)
-    photons = replace(
-        chosen.photons,
-        pulse_energy_j=chosen.photons.pulse_energy_j * 10 ** generator.uniform(-1.5, 2),
-        dead_s=10 ** generator.uniform(-9.5, -6.5),
-        dark_hz=10 ** generator.uniform(1, 6),
-    )
-    return replace(
-        chosen,
-        estimator=str(generator.choice(["peak", "matched"])),
-        divergence_rad=chosen.divergence_rad * generator.uniform(0.2, 1),
-        footprint_rays=19,
-        bins=None,
-        photons=photons,
-    )
-
-
-def random_case(seed):
-    generator = np.random.default_rng(seed)
-    start = generator.choice([0.1, 0.5, 1.0])
-    rays = grid(24, 0.4, (start, start + generator.uniform(0.5, 3)))
-    return random_scene(generator), random_detector(generator), rays
-
-
-def resolution_m(scene, detector, rays):
-    return FirstHits.of(scene, 0, detector, [rays], SceneCaster(scene)).resolution_m
-
-
 def check_effect(name, bound, scene, detector, rays):
     """Against light in photons where they are counted, against geometry elsewhere."""
     base = frozenset({"photon_noise"}) if detector.photons is not None and name != "photon_noise" else frozenset()
-    far_m = max(5 * bound.range_m, resolution_m(scene, detector, rays), 1e-6)
+    resolved_m = FirstHits.of(scene, 0, detector, [rays], SceneCaster(scene)).resolution_m
+    far_m = max(5 * bound.range_m, resolved_m, 1e-6)
     after, count, wrong = errors(scene, rays, Physics(detector, base | {name}, 1), far_m)
     before, _, wrong_before = errors(scene, rays, Physics(detector, base, 1) if base else None, far_m)
     returns = max(int(simulate(scene, rays)[0].returned.sum()), 1)
@@ -411,24 +290,10 @@ def check_effect(name, bound, scene, detector, rays):
 
 @pytest.mark.parametrize("seed", range(25))
 def test_no_effect_changes_more_than_its_bound(seed):
-    scene, detector, rays = random_case(seed)
-    found = decisions(Planner(detector).plan(scene, [rays]))
+    case = random_case(seed)
+    found = decisions(Planner(case.detector).plan(case.scene, [case.rays]))
     for name in sorted(SIMULATED):
-        check_effect(name, found[name].bound, scene, detector, rays)
-
-
-@pytest.mark.parametrize("seed", range(100, 118))
-def test_planned_effects_err_as_all_do_within_the_tolerance(seed):
-    scene, detector, rays = random_case(seed)
-    tolerance = Tolerance(2 * Tolerance.of(detector).range_m, 0.01)
-    chosen = Planner(detector, tolerance=tolerance).plan(scene, [rays]).effects & SIMULATED
-    far_m = max(5 * tolerance.range_m, resolution_m(scene, detector, rays), 1e-3)
-    planned, count, wrong = errors(scene, rays, Physics(detector, chosen, 1) if chosen else None, far_m)
-    every, _, wrong_every = errors(scene, rays, Physics(detector, SIMULATED, 1), far_m)
-    noise_m = STANDARD_ERRORS * np.sqrt(max(planned, every) / (2 * max(count, 1)))
-    assert abs(np.sqrt(planned) - np.sqrt(every)) <= tolerance.range_m + noise_m
-    returns = max(int(simulate(scene, rays)[0].returned.sum()), 1)
-    assert abs(wrong - wrong_every) <= tolerance.lost + STANDARD_ERRORS * np.sqrt(max(wrong, 1 / returns) / returns)
+        check_effect(name, found[name].bound, case.scene, case.detector, case.rays)
 
 
 def test_rays_without_a_return_invent_one_as_rarely_as_asked_though_gates_end_within_bins():
@@ -454,28 +319,33 @@ def wall(range_m, half_width_m=9.0, lux=1e5):
     return Scene((Body(box, "wall", poses=rigid(translation_m=(range_m + 0.05, 0, 0))),), ambient=Ambient(lux))
 
 
-def check_plan(scene, detector):
+CALLED_FOR = {
+    "light that hides echoes behind it, though its level is low": (
+        {"ambient", "pile_up"}, wall(0.8), counting(pulse_energy_j=1e-12, field_of_view_sr=5e-5),
+    ),
+    "false alarms where gates start": ({"ambient", "pile_up"}, wall(3.0), counting(pulse_energy_j=1e-13)),
+    "rare false alarms, which are none under pile-up": (
+        {"ambient", "pile_up"}, wall(1.0, half_width_m=0.15),
+        replace(counting(pulse_energy_j=1e-13), false_alarm=1e-4),
+    ),
+    "fog that hides echoes behind it, though it is faint": (
+        {"atmosphere", "pile_up"}, replace(wall(0.8, lux=0.0), medium=Medium(0.39, 0.02)),
+        counting(pulse_energy_j=1e-11),
+    ),
+    "timing errors of the first of many photons": ({"jitter"}, wall(0.8, lux=0.0), counting(pulse_energy_j=1e-12)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("effects", "scene", "detector"), CALLED_FOR.values(), ids=CALLED_FOR)
+def test_light_that_is_easily_overlooked_is_called_for(effects, scene, detector):
     """Planned effects and all of them give the same share of wrong returns, and errors within the tolerance."""
     plan = Planner(detector).plan(scene, [RAYS])
+    assert effects <= plan.effects
     chosen = plan.effects & SIMULATED
     planned, _, wrong = errors(scene, RAYS, Physics(detector, chosen, 1) if chosen else None, 0.05)
     every, _, wrong_every = errors(scene, RAYS, Physics(detector, SIMULATED, 1), 0.05)
     assert abs(np.sqrt(planned) - np.sqrt(every)) <= plan.tolerance.range_m
     assert abs(wrong - wrong_every) <= 0.005
-    return plan.effects
-
-
-def test_without_dead_time_everything_is_left():
-    detector = replace(THIN, photons=replace(THIN.photons, dead_s=0.0))
-    found = counts(wall(0.8), detector, RAYS)
-    blind = Blindness.of(found)
-    assert (blind.left == found.in_air).all()
-    assert all((share == 1).all() for share in (blind.awake, blind.under, blind.level))
-    assert (blind.early == 0).all()
-    assert missed_behind(found, blind, np.zeros(len(RAYS))) == pytest.approx(
-        found.missed(found.in_air, found.per_bin, np.zeros(len(RAYS)))
-    )
-    assert (unevenness(found, blind) == 0).all()
 
 
 @pytest.mark.parametrize("field_of_view_sr", [1e-6, 1e-5])
@@ -497,25 +367,3 @@ def test_what_is_left_is_what_is_counted(field_of_view_sr):
     assert echo.mean() == pytest.approx(blind.left[0], rel=0.05)
     start = drawn[:, 1:20].sum(axis=1).mean() / (19 * found.per_bin[0])
     assert start == pytest.approx(blind.awake[0], abs=0.03)
-
-
-def test_light_that_hides_echoes_behind_it_is_called_for_though_its_level_is_low():
-    assert {"ambient", "pile_up"} <= check_plan(wall(0.8), counting(pulse_energy_j=1e-12, field_of_view_sr=5e-5))
-
-
-def test_false_alarms_where_gates_start_call_for_light_and_pile_up():
-    assert {"ambient", "pile_up"} <= check_plan(wall(3.0), counting(pulse_energy_j=1e-13))
-
-
-def test_rare_false_alarms_are_none_under_pile_up():
-    detector = replace(counting(pulse_energy_j=1e-13), false_alarm=1e-4)
-    assert {"ambient", "pile_up"} <= check_plan(wall(1.0, half_width_m=0.15), detector)
-
-
-def test_fog_that_hides_echoes_behind_it_is_called_for_though_it_is_faint():
-    foggy = replace(wall(0.8, lux=0.0), medium=Medium(0.39, 0.02))
-    assert {"atmosphere", "pile_up"} <= check_plan(foggy, counting(pulse_energy_j=1e-11))
-
-
-def test_timing_errors_count_for_the_first_of_many_photons():
-    assert "jitter" in check_plan(wall(0.8, lux=0.0), counting(pulse_energy_j=1e-12))

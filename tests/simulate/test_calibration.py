@@ -25,7 +25,7 @@ from lidardesign.simulate.detector.physics import IDEAL, Physics
 from lidardesign.simulate.returns import simulate
 
 ZONES = load_detector("consumer-8x8")
-REPEATS = 24
+REPEATS = 12
 RANGER = """\
 schema_version: 1
 maker: Example
@@ -76,12 +76,6 @@ def test_a_stated_share_is_that_of_the_rays_whatever_the_detector_and_the_number
     part, scanned = find_part(ranger), load_detector("single-photon")
     for design, detector in ((of_part(part, 1, [ranger]), scanned), (of_part(part, 3, [ranger]), ZONES)):
         assert detected_share(design, 0.9, 0.18, 20, detector) == pytest.approx(0.9, abs=0.08)
-
-
-def test_parts_see_less_in_more_light_and_further_away():
-    design = of_part(find_part("vl53l5cx"))
-    shares = [detected_share(design, *at, ZONES) for at in ((1.1, 0.88, 0.1), (1.1, 0.88, 5), (1.3, 0.88, 5))]
-    assert shares[0] > shares[1] > shares[2]
 
 
 def test_light_is_the_detector_s_own_where_nothing_is_stated_or_nothing_counted():

@@ -11,7 +11,7 @@ from scipy.stats import norm
 from support.references import first_photon_distribution
 
 from lidardesign.simulate.detector.dead_time import alive_shares, find_corrected
-from lidardesign.simulate.detector.kernels import at_least, find_returns, pulse_shape
+from lidardesign.simulate.detector.kernels import at_least, find_returns
 
 WHOLE = np.ones((1, 2))
 SIGMA, HALF = 2.5, 2
@@ -49,16 +49,6 @@ def test_tails_of_very_bright_light_are_normal_and_whole_at_their_edges():
     assert at_least(2, 3.0) == 1
 
 
-def test_the_pulse_s_shape_is_even_and_whole():
-    for sigma in (0.0, 0.1, 1.0, 7.3):
-        shape = pulse_shape(1.0, sigma, 1000)
-        # four standard deviations to either side leave 6e-5
-        assert shape.sum() == pytest.approx(1.0, abs=1e-4)
-        np.testing.assert_allclose(shape, shape[::-1])
-        assert len(pulse_shape(1.0, sigma, 5)) <= 9
-    assert np.array_equal(pulse_shape(1.0, 0.0, 10), [1.0])
-
-
 @pytest.mark.parametrize("centre", [12.5, 12.6, 12.9, 13.0, 40.2])
 def test_the_matched_filter_finds_a_pulse_anywhere_in_a_bin(centre):
     # rounding to whole photons moves the pulse by about a thousandth of a bin
@@ -81,9 +71,9 @@ def log_likelihood(counts, place, signal, level):
 @pytest.mark.parametrize("photons", [20, 100])
 def test_the_matched_filter_agrees_with_the_largest_likelihood(photons):
     generator = np.random.default_rng(photons)
-    size, level, off = 100, 0.5, []
+    size, level, off = 60, 0.5, []
     places = np.arange(0.0, size, 0.1)
-    for _ in range(20):
+    for _ in range(15):
         truth = generator.uniform(10, size - 10)
         counts = generator.poisson(photons * np.diff(norm.cdf((np.arange(size + 1) - truth) / SIGMA)) + level)
         best = places[np.argmax([log_likelihood(counts, place, photons, level) for place in places])]
@@ -96,11 +86,6 @@ def test_the_highest_bin_is_the_first_of_equals():
     counts = np.zeros(20, int)
     counts[[7, 11]] = 5
     assert found(counts, matched=False, half=0, sigma=0.0) == 7.5
-
-
-def test_no_photons_are_no_return():
-    assert np.isnan(found(np.zeros(20, int)))
-    assert np.isnan(found(np.zeros(0, int)))
 
 
 def test_one_photon_is_a_return_in_darkness_and_none_in_light():
@@ -137,11 +122,14 @@ def test_parts_of_bins_count_as_parts():
 @pytest.mark.parametrize("matched", [True, False])
 def test_any_histogram_gives_a_place_inside_or_none(matched):
     generator = np.random.default_rng(2)
-    for size in (1, 2, 3, 7, 50):
+    ways = {"matched": matched, "false_alarm": 1e9}
+    for size in (0, 1, 2, 3, 7, 50):
         for brightness in (0.01, 1.0, 1e3, 1e11):
-            for sigma in (0.0, 0.4, 3.0, 40.0):
-                counts = generator.poisson(brightness, size)
-                place = found(counts, matched=matched, sigma=sigma, half=int(1.18 * sigma), false_alarm=1e9)
+            counts = generator.poisson(brightness, size)
+            places = [found(counts, sigma=sigma, half=int(1.18 * sigma), **ways) for sigma in (0.0, 0.4, 3.0, 40.0)]
+            for dead, period in ((1.0, 1e3), (1e6, 1e3), (1e12, 60.0)):
+                places.append(found_corrected(counts, dead=dead, period=period, pulses=10, **ways))
+            for place in places:
                 assert np.isnan(place) if counts.sum() == 0 else 0 <= place <= size
 
 
@@ -177,14 +165,6 @@ class TestCorrected:
             assert corrected == plain
 
     @pytest.mark.parametrize("seed", range(5))
-    def test_what_pile_up_tilts_is_no_pulse(self, seed):
-        """Even light that is counted once per pulse: exp(-l b)."""
-        generator = np.random.default_rng(seed)
-        counts = generator.multinomial(4000, first_photon_distribution([0.02] * 200))[:-1]
-        assert np.isfinite(found(counts))
-        assert np.isnan(found_corrected(counts, dead=1e3, pulses=4000))
-
-    @pytest.mark.parametrize("seed", range(5))
     def test_a_pulse_behind_the_tilt_is_found(self, seed):
         generator = np.random.default_rng(seed)
         arriving = np.full(200, 0.01) + 0.15 * np.diff(norm.cdf((np.arange(201) - 90.2) / SIGMA))
@@ -197,15 +177,3 @@ class TestCorrected:
         counts = np.round(1e5 * first_photon_distribution(arriving)[:-1]).astype(int)
         assert found(counts) < 30.3 - 0.4 * SIGMA
         assert found_corrected(counts, dead=1e3, pulses=1e5) == pytest.approx(30.3, abs=0.1 * SIGMA)
-
-    @pytest.mark.parametrize("matched", [True, False])
-    def test_any_histogram_gives_a_place_inside_or_none(self, matched):
-        generator = np.random.default_rng(2)
-        for size in (1, 2, 3, 7, 50):
-            for brightness in (0.01, 1.0, 1e3, 1e11):
-                for dead, period in ((1.0, 1e3), (1e6, 1e3), (1e12, 60.0)):
-                    counts = generator.poisson(brightness, size)
-                    place = found_corrected(
-                        counts, matched=matched, dead=dead, period=period, pulses=10, false_alarm=1e9
-                    )
-                    assert np.isnan(place) if counts.sum() == 0 else 0 <= place <= size

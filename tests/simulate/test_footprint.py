@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.rays import rays_along
 
 from lidardesign.scenes.casting import SceneCaster
-from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Body, Box, Plane, Scene, rigid
 from lidardesign.simulate.detector.light import Beams, direct_echoes
 from lidardesign.simulate.detector.physics import Detector
@@ -23,11 +23,8 @@ def wide(rays=64, divergence_rad=2 * HALF_RAD):
     return Detector("wide", divergence_rad=divergence_rad, footprint_rays=rays)
 
 
-def beams_along(directions, origin=(0.0, 0.0, 0.0)):
-    directions = np.atleast_2d(np.asarray(directions, float))
-    count = len(directions)
-    origins = np.tile(np.asarray(origin, float), (count, 1))
-    return Beams.of(Rays(origins, directions, np.tile([0.0, 10.0], (count, 1)), np.zeros(count), np.arange(count)))
+def beams_along(directions):
+    return Beams.of(rays_along(directions, (0.0, 10.0)))
 
 
 def echoes_of(scene, beams):

@@ -12,8 +12,7 @@ from support.references import STANDARD_ERRORS
 from support.synthetic_light import PHOTON_EFFECTS
 
 from lidardesign.errors import ConfigError
-from lidardesign.scenes.rays import Outcome
-from lidardesign.scenes.scene import SPEED_OF_LIGHT_M_S, Ambient, Body, Box, Plane, Scene, Sphere, rigid
+from lidardesign.scenes.scene import SPEED_OF_LIGHT_M_S, Ambient, Body, Plane, Scene, Sphere, rigid
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.detector.light import FIRST_NM, LED_AT_1_LUX, STEP_NM, SUN_AT_100_KLUX, spectral_irradiance
 from lidardesign.simulate.detector.physics import PLANCK_J_S, Physics, metres
@@ -104,28 +103,21 @@ def test_irradiance_is_linear_in_illuminance_and_none_in_darkness():
         assert none == 0
 
 
-def face_like(lux=300.0, source="indoor"):
+def face_like():
     """A ball of a head's size at 0.4 m, and rays over most of it."""
     ball = Body(Sphere(0.09), poses=rigid(None, (0.49, 0.0, 0.0)))
-    scene = Scene((ball,), name="ball", ambient=Ambient(lux, source))
+    scene = Scene((ball,), name="ball", ambient=Ambient(300.0, "indoor"))
     across, up = np.meshgrid(np.linspace(-0.15, 0.15, 24), np.linspace(-0.15, 0.15, 24))
     return scene, np.stack([np.ones(576), across.ravel(), up.ravel()], axis=1)
-
-
-def measured(scene, directions, gate_m):
-    rays = rays_towards(directions, gate_m)
-    truth = simulate(scene, rays)[0]
-    found = simulate(scene, rays, physics=Physics(DETECTOR, PHOTON_EFFECTS))[0]
-    with np.errstate(invalid="ignore"):
-        outliers = found.returned & ~(np.abs(found.range_m - truth.range_m) < 0.01)
-    return truth, found, outliers
 
 
 def test_the_single_photon_preset_sees_a_face_indoors_with_few_photons_and_little_pile_up():
     scene, directions = face_like()
     rays = rays_towards(directions, (0.0, 1.0))
     histograms = captured(scene, rays, PHOTON_EFFECTS)
-    truth, found, outliers = measured(scene, directions, (0.0, 1.0))
+    truth, found = simulate(scene, rays)[0], simulate(scene, rays, physics=Physics(DETECTOR, PHOTON_EFFECTS))[0]
+    with np.errstate(invalid="ignore"):
+        outliers = found.returned & ~(np.abs(found.range_m - truth.range_m) < 0.01)
     counts = histograms.counts.sum(axis=1)[truth.returned]
     assert 50 < np.median(counts) < 300
     assert np.median(counts / histograms.pulses[truth.returned]) < 0.1
@@ -133,17 +125,6 @@ def test_the_single_photon_preset_sees_a_face_indoors_with_few_photons_and_littl
     assert outliers.mean() < 0.01
     good = truth.returned & found.returned & ~outliers
     assert np.sqrt(np.mean((found.range_m - truth.range_m)[good] ** 2)) < 0.0006
-
-
-def test_the_single_photon_preset_suffers_in_sunlight_and_profits_from_narrow_gates():
-    scene, directions = face_like(1e5, "sun")
-    shares = {}
-    for gate_m in ((0.0, 5.0), (0.0, 1.0), (0.38, 0.48)):
-        _, found, outliers = measured(scene, directions, gate_m)
-        shares[gate_m] = outliers.sum() / found.returned.sum()
-    assert shares[0.0, 5.0] > 0.05
-    assert shares[0.0, 1.0] > 0.05
-    assert shares[0.38, 0.48] < 0.02
 
 
 def test_captures_hold_the_photons_that_returns_are_read_from():
@@ -173,30 +154,6 @@ def test_captures_of_no_rays_are_empty_and_need_a_detector_that_counts_photons()
     assert captured(scene, rays_towards(np.zeros((0, 3)), (0.3, 0.6)), PHOTON_EFFECTS).counts.shape == (0, 0)
     with pytest.raises(ConfigError, match="counts no photons"):
         captured(scene, rays_towards(directions, (0.3, 0.6)), {"jitter"}, load_detector("ideal"))
-
-
-def test_rays_keep_the_outcome_of_their_geometry_and_dark_surfaces_are_not_detected():
-    wall = Body(Box((0.05, 0.05, 0.05)), poses=rigid(None, (0.4, 0.0, 0.0)), reflectance=0.0)
-    far = Body(Sphere(0.5), poses=rigid(None, (0.0, 3.0, 0.0)))
-    near = Body(Sphere(0.05), poses=rigid(None, (0.0, -0.1, 0.0)))
-    scene = Scene((wall, far, near))
-    rays = rays_towards([[1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1]], (0.2, 1.0))
-    found = simulate(scene, rays, physics=Physics(DETECTOR, PHOTON_EFFECTS))[0]
-    expected = [Outcome.NOT_DETECTED, Outcome.AFTER_GATE, Outcome.OCCLUDED, Outcome.MISS]
-    assert found.outcome.tolist() == expected
-    assert np.isnan(found.range_m).all()
-    assert (found.body == -1).all()
-
-
-def test_noise_that_is_taken_for_a_return_belongs_to_no_body():
-    noisy = replace(DETECTOR, photons=replace(DETECTOR.photons, dark_hz=3e6), false_alarm=0.3)
-    scene = ceiling(2.0)
-    rays = rays_towards(np.tile([0.0, 0.0, -1.0], (500, 1)), (0.5, 1.5))
-    found = simulate(scene, rays, physics=Physics(noisy, PHOTON_EFFECTS))[0]
-    assert 0 < found.returned.mean() < 0.3 + STANDARD_ERRORS * math.sqrt(0.3 * 0.7 / 500)
-    assert (found.body == -1).all()
-    assert (found.range_m[found.returned] >= 0.5).all()
-    assert set(found.outcome.tolist()) == {Outcome.RETURN, Outcome.MISS}
 
 
 @pytest.mark.parametrize("choice", ["auto", "none", "all"])

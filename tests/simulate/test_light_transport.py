@@ -6,14 +6,13 @@ Without the simulator only its process and its absence are tested; everything el
 from __future__ import annotations
 
 import math
-import subprocess
 import sys
 from dataclasses import replace
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from support.transients import binned, flood, needs_simulator, pixel_rays, rays_from, spiral, spot
 
 from lidardesign.errors import ConfigError, NumericalError
@@ -44,11 +43,7 @@ ENERGY, MOST_ENERGY = 1e-5, 5e-3
 BIN_M = 0.0075
 PULSE_FWHM_M = 0.015
 VIEW_RAD = 0.9
-
-
-def turned(seed: int) -> np.ndarray:
-    rotation = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
-    return rotation * np.sign(np.linalg.det(rotation))
+TURNED = Rotation.random(random_state=1).as_matrix()
 
 
 def plane_scene() -> Scene:
@@ -58,7 +53,7 @@ def plane_scene() -> Scene:
 
 
 def sphere_scene() -> Scene:
-    return Scene((Body(Sphere(0.12), reflectance=0.4, poses=rigid(turned(1), (0.45, 0.01, 0.02))),), "sphere")
+    return Scene((Body(Sphere(0.12), reflectance=0.4, poses=rigid(TURNED, (0.45, 0.01, 0.02))),), "sphere")
 
 
 @lru_cache(maxsize=1)
@@ -120,8 +115,9 @@ def test_every_ray_has_the_gain_and_the_time_of_the_direct_component(name, recei
 
 
 @needs_simulator
-@pytest.mark.parametrize("emitter_m", [(0.0, 0.0, 0.0), (-0.02, -0.08, 0.05)], ids=["co-located", "elsewhere"])
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize(
+    ("name", "emitter_m"), [("sphere", (0.0, 0.0, 0.0)), *((name, (-0.02, -0.08, 0.05)) for name in ("plane", "face"))]
+)
 def test_the_transient_of_a_whole_view_has_the_same_peak_and_energy(name, emitter_m):
     """Forward: a spot light of 1 W and a camera of the simulator's, against our beams from the emitter."""
     receiver = Receiver((0, 0, 0), 0.0, 0.0, VIEW_RAD, VIEW_RAD, (0.0, 5.0))
@@ -148,7 +144,7 @@ def test_the_transient_of_a_whole_view_has_the_same_peak_and_energy(name, emitte
 @pytest.mark.parametrize("offset_m", [0.0, 1e5])
 def test_every_shape_is_exported_where_it_is(shape, offset_m):
     place = np.array([1.5 + offset_m, 0.2, 0.1])
-    scene = Scene((Body(shape, reflectance=0.6, poses=rigid(turned(2), place)),))
+    scene = Scene((Body(shape, reflectance=0.6, poses=rigid(TURNED, place)),))
     rays = rays_from((offset_m, 0.0, 0.0), spiral(500, 0.3), far_m=100.0)
     echoes = single_bounces(scene, rays)
     found = render_transient(scene, 0, rays, flood(rays.origin_m[:1]), PathBins(0.01, 1))
@@ -159,7 +155,7 @@ def test_every_shape_is_exported_where_it_is(shape, offset_m):
 @needs_simulator
 @pytest.mark.parametrize("shape", [Cylinder(0.2, 0.25), Ellipsoid((0.2, 0.3, 0.25))], ids=repr)
 def test_shapes_that_the_renderer_takes_as_meshes_send_back_as_much_light(shape):
-    scene = Scene((Body(shape, poses=rigid(turned(2), (1.5, 0.2, 0.1))),))
+    scene = Scene((Body(shape, poses=rigid(TURNED, (1.5, 0.2, 0.1))),))
     rays = rays_from((0.0, 0.0, 0.0), spiral(500, 0.3), far_m=100.0)
     echoes = single_bounces(scene, rays)
     found = render_transient(scene, 0, rays, flood(rays.origin_m[:1]), PathBins(0.01, 1)).steady
@@ -222,30 +218,9 @@ def test_what_a_ray_sees_does_not_depend_on_the_rays_after_it():
     assert np.abs(other.steady - whole.steady).max() > 1e-4 * whole.steady.max()
 
 
-def test_a_camera_fills_its_field_of_view():
-    receiver = Receiver((1, 2, 3), 0.4, -0.2, 1.0, 0.6, (0.0, 5.0))
-    rays, solid_sr = pixel_rays(receiver, 64, 48)
-    # a rectangle's solid angle, 4 asin(sin a sin b) for half angles a, b of its pyramid's sides
-    tangents = math.tan(0.5) * math.tan(0.3)
-    whole = 4 * math.atan(tangents / math.sqrt(1 + math.tan(0.5) ** 2 + math.tan(0.3) ** 2))
-    assert solid_sr.sum() == pytest.approx(whole, rel=1e-3)
-    ahead = np.array([math.cos(-0.2) * math.cos(0.4), math.cos(-0.2) * math.sin(0.4), math.sin(-0.2)])
-    mean = (rays.direction * solid_sr[:, None]).sum(axis=0)
-    np.testing.assert_allclose(mean / np.linalg.norm(mean), ahead, atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("name", "version"),
-    [
-        ("libLLVM-19.so", 19),
-        ("libLLVM-19.so.1", 19),
-        ("libLLVM.so.19.1", 19),
-        ("libLLVM-14.0.6.so.1", 14),
-        ("libLLVMSupport.so", None),
-    ],
-)
-def test_versions_are_read_from_the_names_of_libraries(name, version):
-    assert process.llvm_version(name) == version
+def test_versions_are_read_from_the_names_of_libraries():
+    names = ("libLLVM-19.so", "libLLVM-19.so.1", "libLLVM.so.19.1", "libLLVM-14.0.6.so.1", "libLLVMSupport.so")
+    assert [process.llvm_version(name) for name in names] == [19, 19, 19, 14, None]
 
 
 def test_an_old_or_absent_library_is_not_used_even_if_it_is_named(monkeypatch, tmp_path):
@@ -287,34 +262,20 @@ def test_a_process_that_dies_or_takes_too_long_is_reported_with_what_it_said(mon
     process.end_worker()
     monkeypatch.setattr(process, "WORKER", f"support.work:{work}")
     monkeypatch.setattr(process, "missing", lambda: None)
-    for _ in range(2):
-        with pytest.raises(NumericalError) as caught:
-            process.ask({}, {}, limit_s=limit_s)
-        assert all(word in str(caught.value) for word in words)
-        assert not process._running
+    with pytest.raises(NumericalError) as caught:
+        process.ask({}, {}, limit_s=limit_s)
+    assert all(word in str(caught.value) for word in words)
+    assert not process._running
 
 
 @needs_simulator
-def test_the_simulator_runs_from_any_folder_and_is_imported_in_its_own_process_alone(tmp_path):
+def test_the_simulator_runs_from_any_folder_and_is_imported_in_its_own_process_alone(tmp_path, monkeypatch):
     (tmp_path / "mitsuba.py").write_text("raise SystemExit('the wrong one')")
-    code = (
-        "import sys\n"
-        f"sys.path.insert(0, {str(Path(__file__).parents[1])!r})\n"
-        "import numpy as np\n"
-        "from lidardesign.scenes.scene import Body, Scene, Sphere, rigid\n"
-        "from lidardesign.simulate.light_transport.transport import PathBins, render_transient\n"
-        "from support.transients import flood, rays_from, spiral\n"
-        "ball = Scene((Body(Sphere(0.12), poses=rigid(translation_m=(0.45, 0.01, 0.02))),))\n"
-        "rays = rays_from((0, 0, 0), spiral(4, 0.1))\n"
-        "found = render_transient(ball, 0, rays, flood(rays.origin_m[:1]), PathBins(0.1, 9))\n"
-        "assert found.steady.all()\n"
-        "assert not {'mitsuba', 'drjit', 'mitransient'} & set(sys.modules)\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-P", "-c", code],
-        cwd=tmp_path, capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    monkeypatch.chdir(tmp_path)
+    process.end_worker()
+    rays = rays_from((0, 0, 0), spiral(4, 0.1))
+    assert render_transient(sphere_scene(), 0, rays, flood(rays.origin_m[:1]), PathBins(0.1, 9)).steady.all()
+    assert not {"mitsuba", "drjit", "mitransient"} & set(sys.modules)
 
 
 @needs_simulator

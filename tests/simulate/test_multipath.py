@@ -15,6 +15,7 @@ from lidardesign.scenes.scene import Body, Box, Mesh, Plane, Receiver, Scene, Sp
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.detector.light import Beams, direct_echoes
 from lidardesign.simulate.detector.physics import Detector, Physics
+from lidardesign.simulate.effects.multipath import interreflections
 from lidardesign.simulate.light_transport.detours import Detours, lamp_bound, pixel_bound, series
 from lidardesign.simulate.light_transport.transport import Lights, PathBins, render_transient
 from lidardesign.simulate.returns import simulate
@@ -49,8 +50,6 @@ def into_the_corner(count: int = 400) -> Rays:
 
 def shares(scene: Scene, rays: Rays, detector: Detector) -> tuple[np.ndarray, np.ndarray]:
     """Light by detours over direct light per ray, 0 where none is direct, and its mean delay in half paths [m]."""
-    from lidardesign.simulate.effects.multipath import interreflections
-
     found = interreflections(scene, 0, rays, Physics(detector, frozenset({"multipath"}), seed=2))
     direct = direct_echoes(scene, Beams.of(rays), shared_caster(scene, 0).first_hit(rays.origin_m, rays.direction))
     gain, path_m = np.zeros(len(rays)), np.zeros(len(rays))
@@ -106,10 +105,9 @@ def test_a_scanned_pixel_hears_its_own_spot_by_way_of_the_wall_as_in_closed_form
 
 
 @needs_simulator
-@pytest.mark.parametrize("count", [400, 3000])
-def test_a_flood_of_rays_hears_what_a_lamp_of_the_same_cone_shows(count):
+def test_a_flood_of_rays_hears_what_a_lamp_of_the_same_cone_shows():
     """The spots of rays, even in solid angle, stand for a lamp that lights the cone evenly."""
-    rays = into_the_corner(count)
+    rays = into_the_corner(1000)
     share, late_m = shares(corner(), rays, FLOOD)
     lights = spot(rays.origin_m[:1], np.array([[1.0, 0, -0.5]]), 0.5, 1.0)
     bins = PathBins(0.02, 1024)
@@ -120,14 +118,11 @@ def test_a_flood_of_rays_hears_what_a_lamp_of_the_same_cone_shows(count):
     # how densely rays lie is told from six neighbours, worst at the edge of the field
     assert share @ weight == pytest.approx(lamp @ weight, rel=0.15)
     assert np.median(share / lamp) == pytest.approx(1, abs=0.12)
-    lamp_late_m = (binned(indirect) @ bins.centres_m / indirect.steady - 2 * direct_range(rays)) / 2
+    direct_m = shared_caster(corner(), 0).first_hit(rays.origin_m, rays.direction).range_m
+    lamp_late_m = (binned(indirect) @ bins.centres_m / indirect.steady - 2 * direct_m) / 2
     assert np.average(late_m, weights=share * weight) == pytest.approx(
         np.average(lamp_late_m, weights=lamp * weight), rel=0.15
     )
-
-
-def direct_range(rays: Rays) -> np.ndarray:
-    return shared_caster(corner(), 0).first_hit(rays.origin_m, rays.direction).range_m
 
 
 @needs_simulator
@@ -136,7 +131,7 @@ def test_a_fixed_receiver_hears_a_beam_by_way_of_the_wall_as_an_integral_says():
     wide = Receiver((0.0, 0.3, 0.5), 0.0, 0.0, 3.0, 3.0, (0.0, 10.0))
     rays = rays_from(EMITTER_M, np.array([[0.6, 0.1, -0.5]]) / math.sqrt(0.62))
     spot = np.array([0.6, 0.1, 0.0])
-    step = 0.01
+    step = 0.02
     y, z = np.meshgrid(np.arange(-8, 8, step) + step / 2, np.arange(0, 8, step) + step / 2)
     wall = np.stack([np.ones_like(y), y, z], axis=-1)
     out, back = wall - spot, np.asarray(wide.origin_m) - wall
@@ -145,7 +140,7 @@ def test_a_fixed_receiver_hears_a_beam_by_way_of_the_wall_as_an_integral_says():
     twice = (z / out_m) * (out[..., 0] / out_m**3) * (-back[..., 0] / back_m**3) * inside
     expected = (REFLECTANCE / math.pi) ** 2 * twice.sum() * step**2
     found = render_transient(
-        corner(wide), 0, rays, Lights.receiver(wide), PathBins(0.05, 400), bounces=2, samples=1 << 16, direct=False
+        corner(wide), 0, rays, Lights.receiver(wide), PathBins(0.05, 400), bounces=2, samples=1 << 14, direct=False
     )
     assert found.steady[0] == pytest.approx(expected, rel=0.02)
 
@@ -172,18 +167,6 @@ def test_bounces_add_up_to_a_geometric_series_and_to_a_finite_one_between_white_
     assert math.isfinite(series(1.0))
 
 
-def test_bounds_do_not_depend_on_where_a_scene_is():
-    here = bounded(corner(), into_the_corner(50), FLOOD)
-    moved = np.array([3.0, -2.0, 0.0])
-    there = Scene(
-        tuple(replace(body, poses=rigid(body.pose()[:3, :3], body.pose()[:3, 3] + moved)) for body in corner().bodies)
-    )
-    rays = into_the_corner(50)
-    shifted = bounded(there, replace(rays, origin_m=rays.origin_m + moved), FLOOD)
-    np.testing.assert_allclose(here.share, shifted.share, rtol=1e-6)
-    np.testing.assert_allclose(here.shift_m, shifted.shift_m, rtol=1e-6)
-
-
 def test_rays_that_meet_nothing_have_no_bound():
     rays = rays_from((0, 0, 5), np.array([[0.0, 0, 1]]))
     assert not len(bounded(ball(), rays, FLOOD).chosen)
@@ -191,8 +174,6 @@ def test_rays_that_meet_nothing_have_no_bound():
 
 @needs_simulator
 def test_echoes_name_the_first_hit_and_lie_inside_the_gates():
-    from lidardesign.simulate.effects.multipath import interreflections
-
     rays = into_the_corner(200)
     rays = replace(rays, gate_m=np.tile([0.4, 1.6], (200, 1)))
     found = interreflections(corner(), 0, rays, Physics(FLOOD, frozenset({"multipath"}), 1))
@@ -206,8 +187,6 @@ def test_echoes_name_the_first_hit_and_lie_inside_the_gates():
 
 @needs_simulator
 def test_rays_without_anything_to_hear_have_no_echoes():
-    from lidardesign.simulate.effects.multipath import interreflections
-
     effects = frozenset({"multipath"})
     away = rays_from((0, 0, 5), np.array([[0.0, 0, 1]]))
     assert not len(interreflections(corner(), 0, away, Physics(FLOOD, effects)))

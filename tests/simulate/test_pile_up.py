@@ -1,4 +1,4 @@
-"""Blindness after a count: the first photon's distribution, naive loops over events, Coates' correction."""
+"""Blindness after a count: the first photon's distribution and naive loops over events."""
 
 from __future__ import annotations
 
@@ -48,11 +48,6 @@ def test_the_first_photon_of_a_pulse_follows_its_distribution(per_bin):
     statistic = np.sum((observed - expected)[enough] ** 2 / expected[enough])
     statistic += (rest[1] - rest[0]) ** 2 / rest[0] if rest[0] > 10 else 0.0
     assert chi2.sf(statistic, enough.sum() - 1) > 1e-4
-
-
-def test_a_pulse_s_photons_are_counted_at_most_once_when_the_dead_time_outlasts_the_gate():
-    assert (even_light(5.0).sum(axis=1) <= PULSES).all()
-    assert (even_light(5.0, pulses=1).sum(axis=1) <= 1).all()
 
 
 def test_an_echo_is_hidden_by_the_light_before_it():
@@ -143,22 +138,11 @@ def test_dead_times_that_reach_the_next_pulse_blind_its_start():
     assert close.sum() < apart.sum()
 
 
-def test_photons_that_fall_into_the_same_pulse_are_counted_once():
-    generator, alive, pulses, photons = np.random.default_rng(7), 60, 100, 80
-    throws = generator.integers(pulses, size=(4000, photons))
-    naive = np.array([np.unique(row[row < alive]).size for row in throws])
-    ours = np.array([_hit_pulses(photons, alive, pulses, z) for z in generator.normal(size=4000)])
-    error = STANDARD_ERRORS * naive.std() * np.sqrt(2 / 4000)
-    assert abs(ours.mean() - naive.mean()) < error
-    # rounding adds 1/12 to a variance
-    assert ours.var() == pytest.approx(naive.var() + 1 / 12, rel=0.15)
-
-
 @pytest.mark.parametrize(("alive", "pulses"), [(1, 10_000), (7, 10_000), (60, 10_000), (300, 10_000), (5, 40)])
 @pytest.mark.parametrize("photons", [33, 80, 400])
 def test_the_last_pulses_are_hit_as_often_as_they_should(alive, pulses, photons):
     """Few of many pulses are alive where gates begin brightly: less than one is hit per bin."""
-    share = (np.arange(100_000) + 0.5) / 100_000
+    share = (np.arange(20_000) + 0.5) / 20_000
     mean = np.mean([_hit_pulses(photons, alive, pulses, z) for z in norm.ppf(share)])
     assert mean == pytest.approx(alive * (1 - (1 - 1 / pulses) ** photons), rel=0.01)
 
@@ -189,22 +173,3 @@ def test_an_echo_that_blinds_one_ray_changes_no_other():
 
 def test_a_detector_without_dead_time_counts_everything():
     assert np.array_equal(even_light(0.5, dead_bins=0), seen(0.5, {"ambient"}))
-
-
-def test_pile_up_only_takes_photons_away():
-    counts, arrived = even_light(0.05, dead_bins=5), seen(0.05, {"ambient"})
-    assert (counts <= arrived).all()
-    assert counts.sum() < arrived.sum()
-
-
-def test_coates_correction_undoes_pile_up_on_counted_photons_within_their_noise():
-    per_bin = 0.04
-    counts = even_light(per_bin).sum(axis=0)
-    pulses = RAYS * PULSES
-    # Coates 1968
-    used = np.cumsum(counts)
-    arrived = np.log((pulses - used + counts) / (pulses - used))
-    alive = pulses * np.exp(-per_bin * np.arange(BINS))
-    # binomial counts of alive pulses
-    assert (np.abs(arrived - per_bin) < STANDARD_ERRORS * np.sqrt(per_bin / alive)).all()
-    assert counts[-1] / pulses < 0.25 * per_bin

@@ -13,7 +13,6 @@ from lidardesign.scenes.scene import Ambient, Body, Box, Medium, Receiver, Scene
 from lidardesign.simulate import plan as plan_module
 from lidardesign.simulate.detector.physics import EFFECTS, IDEAL
 from lidardesign.simulate.plan import Planner, Tolerance, parse_effects
-from lidardesign.simulate.returns import build_casters
 from lidardesign.task import Metric
 
 EVERYTHING = {
@@ -109,12 +108,6 @@ def test_lists_without_rays_and_rays_without_hits_are_planned_for():
     for decision in Planner(SINGLE).plan(room(**EVERYTHING), [away]).decisions:
         assert np.isfinite(decision.bound.range_m)
         assert 0 <= decision.bound.lost <= 1
-
-
-def test_casters_that_are_there_are_used():
-    scene = room()
-    plan = Planner(SINGLE).plan(scene, [grid()], build_casters(scene))
-    assert plan.decisions == Planner(SINGLE).plan(scene, [grid()]).decisions
 
 
 def test_choices_are_taken_as_they_are():

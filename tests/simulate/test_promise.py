@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -19,15 +20,18 @@ from lidardesign.simulate.plan import Planner
 from lidardesign.simulate.returns import simulate
 
 
+@cache
+def kept(seed):
+    return kept_promise(random_case(seed))
+
+
 @pytest.mark.parametrize("seed", range(60))
 def test_what_is_skipped_changes_no_more_than_is_tolerated(seed):
-    kept = kept_promise(random_case(seed))
-    assert not kept.broken, str(kept)
+    assert not kept(seed).broken, str(kept(seed))
 
 
 def test_random_plans_skip_something_in_a_quarter_of_scenes():
-    found = [kept_promise(random_case(seed)).skipped for seed in range(20)]
-    assert sum(map(bool, found)) >= 5
+    assert sum(bool(kept(seed).skipped) for seed in range(20)) >= 5
 
 
 def rounding(jitter_share, bin_m=0.1):
@@ -115,13 +119,12 @@ TOUCHING = {
     "almost": wall_at(1e-12),
     "ball": Scene((Body(Sphere(1.0), poses=rigid(translation_m=(1, 0, 0))),)),
     "mirror": Scene((replace(wall_at(0.0).bodies[0], specular=0.5),)),
-    "far": facing_wall(),
 }
 
 
 @pytest.mark.parametrize("scene", TOUCHING.values(), ids=TOUCHING)
 @pytest.mark.parametrize("detector", [SINGLE, CONSUMER, SHARP, replace(SHARP, estimator="peak"), BRIGHT])
-@pytest.mark.parametrize("gate_m", [(0.0, 4.0), (0.0, 1e-9), (0.5, 4.0)])
+@pytest.mark.parametrize("gate_m", [(0.0, 4.0), (0.0, 1e-9)])
 def test_surfaces_that_touch_a_receiver_are_bounded_without_overflow(scene, detector, gate_m):
     for air in ({}, {"medium": Medium(0.1, 0.01)}, {"receiver": Receiver((0, 0.2, 0), 0, 0, 3.1, 3.1, (0, 20))}):
         with warnings.catch_warnings():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from support.rays import random_fan, rays_along
 
 from lidardesign.scenes.casting import SceneCaster
-from lidardesign.scenes.scene import Body, Box, Mesh, Plane, Receiver, Scene, Sphere, rigid
+from lidardesign.scenes.scene import Body, Box, Mesh, Receiver, Scene, Sphere, rigid
 from lidardesign.simulate.detector.light import Beams, direct_echoes
 from lidardesign.simulate.detector.physics import Detector
 from lidardesign.simulate.effects import specular
@@ -20,7 +21,10 @@ from lidardesign.simulate.effects.motion import still_tracer
 from lidardesign.simulate.effects.specular import MAXIMUM_TURNS, detours
 from lidardesign.space import direction
 
-EVERYWHERE = {"azimuth_rad": 0.0, "elevation_rad": 0.0, "horizontal_rad": 3.1, "vertical_rad": 3.1}
+EVERYWHERE = {
+    "azimuth_rad": 0.0, "elevation_rad": 0.0, "horizontal_rad": 3.1, "vertical_rad": 3.1, "range_m": (0.0, 9.0),
+}  # fmt: skip
+WALL = Body(Box((0.1, 9, 9)), poses=rigid(translation_m=(3.1, 0, 0)))
 
 
 def beams_along(directions, origins=(0.0, 0.0, 0.0)):
@@ -59,9 +63,7 @@ def test_a_flat_mirror_shows_the_image_of_the_scene_at_its_whole_distance(made):
     image = np.array([2.0, -3.0, 0.1]) - 2 * ((np.array([2.0, -3.0, 0.1]) - [2.0, 0, 0]) @ normal) * normal
     looking = fan(spread=0.1)
     direct, led = traced(Scene((mirror, ball)), beams_along(looking))
-    behind, _ = traced(
-        Scene((Body(Sphere(0.8), poses=rigid(translation_m=image), reflectance=0.4),)), beams_along(looking)
-    )
+    behind, _ = traced(Scene((replace(ball, poses=rigid(translation_m=image)),)), beams_along(looking))
     assert len(behind) == len(led) == 100
     assert np.array_equal(led.ray, behind.ray)
     assert (led.body == 1).all()
@@ -71,13 +73,9 @@ def test_a_flat_mirror_shows_the_image_of_the_scene_at_its_whole_distance(made):
 
 
 def test_a_pane_weakens_what_lies_behind_it_by_both_faces_both_ways():
-    pane, wall = (
-        slab(1.0, transmission=0.9, reflectance=0.02),
-        Body(Box((0.1, 9, 9)), poses=rigid(translation_m=(3.1, 0, 0))),
-    )
-    looking = fan()
-    direct, led = traced(Scene((pane, wall)), beams_along(looking))
-    clear, _ = traced(Scene((wall,)), beams_along(looking))
+    pane, looking = slab(1.0, transmission=0.9, reflectance=0.02), fan()
+    direct, led = traced(Scene((pane, WALL)), beams_along(looking))
+    clear, _ = traced(Scene((WALL,)), beams_along(looking))
     assert (direct.body == 0).all()
     behind, far_face = led.subset(led.body == 1), led.subset(led.body == 0)
     assert behind.path_m == pytest.approx(clear.path_m, abs=1e-12)
@@ -121,37 +119,6 @@ def test_faint_beams_are_given_up():
     assert not len(traced(Scene((mirror, ball)), beams_along([[1.0, 0, 0]]))[1])
 
 
-def test_matt_scenes_and_lists_without_rays_have_no_detours():
-    scene = Scene((slab(2.0), Body(Plane(), poses=rigid(translation_m=(0, 0, -1)))))
-    assert not len(traced(scene, beams_along(fan()))[1])
-    glossy = Scene((slab(2.0, specular=0.5),))
-    assert not len(traced(glossy, beams_along(np.empty((0, 3))))[1])
-
-
-def test_turning_the_world_changes_no_path_and_no_gain():
-    generator = np.random.default_rng(4)
-    bodies = (
-        slab(2.0, yaw_rad=0.6, specular=0.6, reflectance=0.2),
-        slab(1.2, yaw_rad=-0.3, transmission=0.8, specular=0.1, reflectance=0.05),
-        Body(Sphere(6.0), poses=np.eye(4)),
-    )
-    world = rigid(Rotation.random(random_state=generator).as_matrix(), generator.normal(size=3))
-    turned = tuple(
-        Body(
-            b.shape, poses=world @ b.poses, reflectance=b.reflectance, specular=b.specular, transmission=b.transmission
-        )
-        for b in bodies
-    )
-    looking = fan(50)
-    _, here = traced(Scene(bodies), beams_along(looking))
-    _, there = traced(Scene(turned), beams_along(looking @ world[:3, :3].T, world[:3, 3]))
-    assert len(here) > 200
-    assert np.array_equal(here.ray, there.ray)
-    assert np.array_equal(here.body, there.body)
-    assert there.path_m == pytest.approx(here.path_m, abs=1e-9)
-    assert there.gain == pytest.approx(here.gain, rel=1e-7, abs=1e-15)
-
-
 def test_light_is_never_made():
     # inside a white, half mirroring room all that comes back by detours is less than what a matt one sends directly
     room = Body(Sphere(3.0), reflectance=0.5, specular=0.3, transmission=0.2)
@@ -165,23 +132,19 @@ def test_light_is_never_made():
 def test_a_fixed_receiver_hears_what_a_mirror_lights_straight_from_there():
     mirror = slab(2.0, yaw_rad=math.radians(45), reflectance=0.0, specular=0.7)
     floor = Body(Box((3.0, 0.1, 3.0)), poses=rigid(translation_m=(2.0, -3.1, 0.0)), reflectance=0.4)
-    receiver = Receiver((0.0, -1.0, 0.0), **{**EVERYWHERE, "azimuth_rad": -0.8}, range_m=(0.0, 9.0))
+    receiver = Receiver((0.0, -1.0, 0.0), **{**EVERYWHERE, "azimuth_rad": -0.8})
     _, led = traced(Scene((mirror, floor), receiver=receiver), beams_along([[1.0, 0.0, 0.0]]))
     # out: 2 m to the mirror and 3 m to the floor at (2, -3); back from there to (0, -1), at 45 degrees
     back_m = math.sqrt(8)
     assert led.path_m == pytest.approx([(5 + back_m) / 2], abs=1e-9)
     assert led.gain == pytest.approx([0.7 * 0.4 * math.cos(math.pi / 4) / (math.pi * 8)], rel=1e-9)
-    behind = Receiver((0.0, -1.0, 0.0), **{**EVERYWHERE, "azimuth_rad": 2.5}, range_m=(0.0, 9.0))
+    behind = replace(receiver, azimuth_rad=2.5)
     assert not len(traced(Scene((mirror, floor), receiver=behind), beams_along([[1.0, 0.0, 0.0]]))[1])
 
 
 def test_a_fixed_receiver_hears_through_panes_on_both_ways():
-    pane, wall = (
-        slab(1.0, transmission=0.9, reflectance=0.0),
-        Body(Box((0.1, 9, 9)), poses=rigid(translation_m=(3.1, 0, 0))),
-    )
-    receiver = Receiver((0.0, 0.5, 0.0), **EVERYWHERE, range_m=(0.0, 9.0))
-    _, led = traced(Scene((pane, wall), receiver=receiver), beams_along([[1.0, 0.0, 0.0]]))
+    pane, receiver = slab(1.0, transmission=0.9, reflectance=0.0), Receiver((0.0, 0.5, 0.0), **EVERYWHERE)
+    _, led = traced(Scene((pane, WALL), receiver=receiver), beams_along([[1.0, 0.0, 0.0]]))
     behind = led.subset(led.body == 1)
     back_m = math.hypot(3.0, 0.5)
     assert behind.path_m == pytest.approx([(3 + back_m) / 2], abs=1e-9)
@@ -202,13 +165,6 @@ def test_beams_leave_large_meshes_for_good_however_near_they_start(radius_m, hei
     beside_a_wall = np.abs(looking[led.ray, :2] * direct.path_m[led.ray, None]).max(axis=1) > 0.6 * radius_m
     assert len(led) > 900
     assert not (again & ~beside_a_wall).any()
-
-
-def test_a_beam_that_starts_on_a_mirror_comes_back_finite():
-    scene = Scene((slab(0.0, reflectance=0.1, specular=0.5, transmission=0.4),))
-    _, led = traced(scene, beams_along(fan()))
-    assert np.isfinite(led.gain).all()
-    assert np.isfinite(led.path_m).all()
 
 
 @pytest.mark.parametrize("at_once", [1, 7, 50])

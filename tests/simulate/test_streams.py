@@ -59,13 +59,6 @@ def test_neighbours_fill_the_square_evenly(direction):
     assert chi2.sf(np.sum((counts - expected) ** 2 / expected), 1023) > UNLIKELY
 
 
-def test_every_upper_bit_is_set_half_the_time():
-    words = (along_rows(5) * 2.0**32).astype(np.uint64)
-    for bit in range(32):
-        share = np.mean((words >> np.uint64(bit)) & np.uint64(1))
-        assert abs(share - 0.5) < STANDARD_ERRORS * 0.5 / np.sqrt(COUNT)
-
-
 def test_one_more_in_any_word_and_other_places_of_words_change_everything():
     base, rows = along_rows(3), np.arange(COUNT)
     for other in (uniforms(4, rows, 0), uniforms(3, rows, 1), uniforms(3, rows + 1, 0)):
@@ -84,10 +77,6 @@ def test_numbers_do_not_depend_on_order_or_company():
     assert normals(9, rows, 1)[5] == normal(np.uint64(9), rows[5], 1)
 
 
-def test_normal_numbers_are_normal():
-    assert kstest(normals(2, np.arange(COUNT), 5), "norm").pvalue > UNLIKELY
-
-
 def test_normal_quantiles_agree_with_scipy():
     shares = np.concatenate([10.0 ** np.arange(-300, 0, 7), np.linspace(1e-6, 1 - 1e-6, 999), [1 - 1e-15]])
     ours = np.array([normal_quantile(share) for share in shares])
@@ -103,7 +92,7 @@ def test_small_poisson_quantiles_are_exact(mean):
 
 @pytest.mark.parametrize("mean", [32.1, 500.0, 1e6])
 def test_large_poisson_quantiles_are_off_by_one_count_at_most_and_seldom(mean):
-    shares = along_rows(8)[:20_000]
+    shares = along_rows(8)[:5000]
     off = np.array([poisson_quantile(mean, share) for share in shares]) - poisson.ppf(shares, mean)
     assert np.abs(off).max() <= 1
     assert np.mean(off != 0) < 0.02

@@ -15,6 +15,7 @@ from lidardesign.config import resolve, save_run_config
 from lidardesign.registry import load_task
 from lidardesign.run.manifest import start_manifest
 from lidardesign.samples import Samples, save_samples
+from support.spaces import log_volume
 
 
 class Result:
@@ -60,7 +61,7 @@ def make_run(folder: Path, count: int = 4000, task: str = "flatland", seed: int 
     log_target = np.logaddexp(*(-distance.T / (2 * 0.1**2)))
     start_manifest(folder, command=["lidardesign", "learn"], seed=seed)
     save_run_config(config, folder)
-    log_prob = np.full(count, -config.space.log_volume)
+    log_prob = np.full(count, -log_volume(config.space))
     save_samples(Samples(points, log_prob, log_target, config.space), folder)
     return folder
 

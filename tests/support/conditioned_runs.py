@@ -8,6 +8,7 @@ from lidardesign.config import resolve, save_run_config
 from lidardesign.registry import load_task
 from lidardesign.run.manifest import start_manifest
 from lidardesign.samples import Samples, save_samples
+from support.spaces import log_volume
 
 
 def log_target(points):
@@ -24,6 +25,6 @@ def make_conditioned_run(folder, count=6000, condition="[x_m]"):
     points = config.space.sample(count, generator)
     start_manifest(folder, command=["lidardesign", "learn"], seed=3)
     save_run_config(config, folder)
-    log_prob = np.full(count, -config.space.log_volume)
+    log_prob = np.full(count, -log_volume(config.space))
     save_samples(Samples(points, log_prob, log_target(points), config.space), folder)
     return folder

@@ -61,21 +61,6 @@ def test_scenes_at_any_scale_are_scored_up_to_their_own_worst_value(balls, moves
     assert checked_score(TASK, metric, scene, blind).value == metric.worst
 
 
-@pytest.mark.parametrize(
-    ("found", "said"),
-    [
-        (1000.0, "it returned float"),
-        (Metric("error", "mm", "lower", 1.0, 0.1), "it returned error \\[mm\\], lower is better"),
-        (Metric("miss", "m", "lower", 1.0, 0.1), "it returned miss \\[m\\]"),
-        (Metric("miss", "mm", "higher", 1.0, 0.1), "higher is better"),
-    ],
-)
-def test_a_metric_of_a_configuration_is_the_same_quantity(found, said):
-    task = SimpleNamespace(name="case", metric=Metric("miss", "mm", "lower", 5.0, 0.1), metric_of=lambda config: found)
-    with pytest.raises(PluginError, match=said):
-        metric_of(task, None)
-
-
 def test_a_configuration_may_choose_among_the_metrics_of_a_task():
     usual, further = Metric("miss", "mm", "lower", 5.0, 0.1), Metric("seen", "%", "higher", 0.0, 1.0)
     task = SimpleNamespace(name="case", metric=usual, metrics=(further,), metric_of=lambda config: config)

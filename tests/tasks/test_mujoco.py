@@ -9,7 +9,6 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-import trimesh
 from lidardesign_tasks.robot.motion import DEPTH_M, Wanderer, joined, spans, window_frames, windows
 from lidardesign_tasks.robot.recordings import Recording, columns, read_recordings
 from lidardesign_tasks.robot.targets import mean_depth_m, refuse_sensors_inside
@@ -25,10 +24,10 @@ from lidardesign.rays.information import require_valid
 from lidardesign.registry import load_task
 from lidardesign.run.manifest import note, start_manifest
 from lidardesign.run_folder import RunFolder, input_hashes
-from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import Outcome, Returns
 from lidardesign.scenes.scene import Sphere
 from lidardesign.scenes.surface import sample_body
+from lidardesign.simulate.returns import simulate
 from lidardesign.space import aim
 
 TASK = MujocoTask()
@@ -48,6 +47,11 @@ REST = [1, 0, 0.1, 1, 0, 0, 0]
 def folder(tmp_path):
     written(tmp_path, ROBOT, "robot.xml")
     return tmp_path
+
+
+@pytest.fixture
+def model(folder):
+    return mujoco.MjModel.from_xml_path(str(folder / "robot.xml"))
 
 
 @pytest.fixture
@@ -80,14 +84,13 @@ def write_csv(path, table):
     [
         "metric=position",
         "metric=surface",
-        "metric=seen",
         "motion=keyframes metric=seen",
         "mount_body=base origin_m=[0,-.4,.3]",
         "mount_body=hand targets=[parcel] origin_m=[.1,0,-.1] metric=seen",
     ],
 )
 def test_the_task_keeps_the_contract(folder, keys):
-    usual = [f"model={folder / 'robot.xml'}", "train=3", "test=3", "frames=6"]
+    usual = [f"model={folder / 'robot.xml'}", "train=2", "test=2", "frames=4"]
     targets = [] if "targets" in keys else ["targets=[hand]"]
     found = contract_of(TASK, overrides=[*usual, *targets, *keys.split()])
     # in another process they are made again by the tests of workers
@@ -98,15 +101,7 @@ def test_the_task_keeps_the_contract(folder, keys):
 # Motion
 
 
-def test_columns_are_called_as_their_joints(folder):
-    model = mujoco.MjModel.from_xml_path(str(folder / "robot.xml"))
-    assert columns(model)[:3] == ["lift", "turn", "parcel.x"]
-    assert columns(model)[-4:] == ["parcel.qw", "parcel.qx", "parcel.qy", "parcel.qz"]
-    assert len(columns(model)) == model.nq
-
-
-def test_a_csv_and_an_npz_of_one_motion_are_one_motion(folder):
-    model = mujoco.MjModel.from_xml_path(str(folder / "robot.xml"))
+def test_a_csv_and_an_npz_of_one_motion_are_one_motion(folder, model):
     motion = table(np.linspace(-1, 1, 30))
     write_csv(folder / "walk.csv", motion)
     np.savez(folder / "walk.npz", **motion)
@@ -122,8 +117,7 @@ def test_a_csv_and_an_npz_of_one_motion_are_one_motion(folder):
         np.testing.assert_allclose(one.at(model, np.array([0.05])), (whole[:1] + whole[1:2]) / 2)
 
 
-def test_a_quaternion_is_unit_between_rows_whatever_its_sign_and_length(folder):
-    model = mujoco.MjModel.from_xml_path(str(folder / "robot.xml"))
+def test_a_quaternion_is_unit_between_rows_whatever_its_sign_and_length(folder, model):
     signs = np.where(np.arange(20) % 2, -3e-200, 2e300)
     angle = np.linspace(0, 3, 20)
     turned = {"parcel.qw": signs * np.cos(angle / 2), "parcel.qz": signs * np.sin(angle / 2)}
@@ -137,9 +131,8 @@ def test_a_quaternion_is_unit_between_rows_whatever_its_sign_and_length(folder):
 BAD = {
     "a joint by another name": (
         lambda t: {("lft" if k == "lift" else k): v for k, v in t.items()},
-        "'lft' is not a joint",
+        "did you mean 'lift'",
     ),
-    "the nearest joint": (lambda t: {("lft" if k == "lift" else k): v for k, v in t.items()}, "did you mean 'lift'"),
     "a joint that is missing": (lambda t: {k: v for k, v in t.items() if k != "turn"}, "joints are missing: turn"),
     "no time": (lambda t: {k: v for k, v in t.items() if k != "time_s"}, "has no column time_s"),
     "time that goes back": (lambda t: {**t, "time_s": -t["time_s"]}, "does not ascend"),
@@ -165,8 +158,7 @@ def test_a_motion_that_cannot_be_used_is_refused_with_its_file(folder, configure
     assert "walk.csv" in str(error.value)
 
 
-def test_an_archive_whose_time_is_one_number_is_refused(folder):
-    model = mujoco.MjModel.from_xml_path(str(folder / "robot.xml"))
+def test_an_archive_whose_time_is_one_number_is_refused(folder, model):
     np.savez(folder / "walk.npz", time_s=0.5, qpos=np.zeros((12, model.nq)))
     np.savez(folder / "point.npz", **{name: 0.5 for name in ("time_s", *columns(model))})
     for name, said in (("walk.npz", "'qpos' is not a joint"), ("point.npz", "less than 2 rows")):
@@ -185,16 +177,14 @@ def test_several_recordings_are_split_by_file_and_one_in_its_middle():
     assert window_frames(whole[:1], 40, 10.0) == 25
 
 
-def test_few_windows_of_many_recordings_are_of_others_with_every_seed(folder):
-    model = mujoco.MjModel.from_xml_path(str(folder / "robot.xml"))
+def test_few_windows_of_many_recordings_are_of_others_with_every_seed(folder, model):
     many = [Recording(f"{i}.csv", np.arange(50) / 10, np.tile([0, 0, *REST], (50, 1))) for i in range(60)]
     shown = [{one.group for one in windows(model, many, "train", 10, 5, 10.0, seed)} for seed in range(6)]
     assert all(len(names) == 10 for names in shown)
     assert len(set.union(*shown)) > 15
 
 
-def test_recordings_go_a_little_beyond_limits_as_those_of_mujoco_do(folder):
-    model = mujoco.MjModel.from_xml_path(str(folder / "robot.xml"))
+def test_recordings_go_a_little_beyond_limits_as_those_of_mujoco_do(folder, model):
     beyond = np.radians(80) + 0.04 * np.radians(160)
     (one,) = read_recordings(model, write_csv(folder / "walk.csv", table(np.full(5, beyond))))
     assert one.qpos[0, 0] == pytest.approx(beyond)
@@ -256,15 +246,13 @@ def test_a_run_tells_that_what_its_task_reads_has_changed(folder, tmp_path):
     assert "robot.xml is gone since" in RunFolder.open(run).input_notes()[0]
 
 
-def test_keyframes_are_passed_at_rest(folder):
-    model = mujoco.MjModel.from_xml_path(str(folder / "robot.xml"))
+def test_keyframes_are_passed_at_rest(folder, model):
     way = joined(model, model.key_qpos[0], model.key_qpos[1], np.linspace(0, 1, 101))
     np.testing.assert_allclose(way[[0, -1]], model.key_qpos[:2])
     assert np.abs(np.diff(way, axis=0)[[0, -1]]).max() < np.abs(np.diff(way, axis=0)).max() / 1000
 
 
-def test_random_ways_do_not_collide_and_contacts_at_rest_are_none(folder):
-    model = mujoco.MjModel.from_xml_path(str(folder / "robot.xml"))
+def test_random_ways_do_not_collide_and_contacts_at_rest_are_none(folder, model):
     wanderer = Wanderer(model, "robot.xml")
     data = mujoco.MjData(model)
     ways = [wanderer.draw(20, 10.0, np.random.default_rng(seed)) for seed in range(10)]
@@ -297,18 +285,6 @@ def test_what_stands_free_is_raised_out_of_the_ground(tmp_path):
 def test_a_target_that_rests_in_all_scenes_is_named(configured):
     config = configured(targets=("parcel",))
     assert any("parcel: at the same place in all scenes" in note for note in TASK.notes(config, TASK.space(config)))
-
-
-def test_a_model_may_read_files_of_the_folder_that_is_named(tmp_path):
-    (tmp_path / "parts").mkdir()
-    (tmp_path / "robots").mkdir()
-    trimesh.creation.icosphere(subdivisions=2, radius=0.1).export(tmp_path / "parts" / "ball.stl")
-    text = """<mujoco><asset><mesh name="ball" file="../parts/ball.stl"/></asset><worldbody><body name="ball">
-    <joint type="slide" range="0 1"/><geom type="mesh" mesh="ball"/></body></worldbody></mujoco>"""
-    keys = {"model": written(tmp_path / "robots", text, "robot.xml"), "targets": ("ball",), "train": 1}
-    with pytest.raises(DataError, match="outside"):
-        TASK.scenes(TASK.Config(**keys), "train", 0)
-    assert TASK.scenes(TASK.Config(**keys, folder=tmp_path), "train", 0)
 
 
 def test_what_collides_at_rest_may_collide(tmp_path):
@@ -402,16 +378,6 @@ def test_the_mean_depth_of_a_ball_is_two_thirds_of_its_radius():
     assert mean_depth_m(points) == pytest.approx(0.2, rel=0.01)
 
 
-def answers(scene, rays):
-    """What rays with open gates return in each frame."""
-    found = []
-    for frame in range(scene.frames):
-        hits = SceneCaster(scene, frame).first_hit(rays.origin_m, rays.direction)
-        outcome = np.where(hits.body >= 0, Outcome.RETURN, Outcome.MISS)
-        found.append(Returns(rays, outcome, np.where(hits.body >= 0, hits.range_m, np.nan), hits.body, frame))
-    return found
-
-
 def disc_rays(scene, target, origin, count=2000):
     """Rays that cross the disc of a ball evenly, in the scene's first frame."""
     generator, body = np.random.default_rng(0), scene.bodies[target]
@@ -426,7 +392,7 @@ def resting(configured, folder):
 
     def scenes(**keys):
         motion = write_csv(folder / "rest.csv", table(np.zeros(50)))
-        return TASK.scenes(configured(motion=motion, frames=3, **keys), "train", 0)
+        return TASK.scenes(configured(motion=motion, **{"frames": 3, **keys}), "train", 0)
 
     return scenes
 
@@ -434,7 +400,7 @@ def resting(configured, folder):
 def test_the_position_of_a_ball_is_found_by_returns_on_it(resting):
     (scene, *_) = resting()
     target = next(i for i, body in enumerate(scene.bodies) if body.is_target)
-    found = TASK.score(scene, answers(scene, disc_rays(scene, target, [0.65, -1.0, 0.9])))
+    found = TASK.score(scene, simulate(scene, disc_rays(scene, target, [0.65, -1.0, 0.9])))
     assert found.value < 0.005
     assert found.details["seen_percent"] == 100.0
 
@@ -443,27 +409,28 @@ def test_what_is_not_known_is_mistaken_for_the_target(resting):
     told_apart, mistaken = (resting(known=known)[0] for known in (("*",), ()))
     target = next(i for i, body in enumerate(told_apart.bodies) if body.is_target)
     rays = disc_rays(told_apart, target, [0.65, -0.5, 2.0])
-    assert (answers(told_apart, rays)[0].body != target).any()
-    assert TASK.score(told_apart, answers(told_apart, rays)).value < TASK.score(mistaken, answers(mistaken, rays)).value
-    assert TASK.informs(told_apart, answers(told_apart, rays)).harm.max() == 0
-    assert TASK.informs(mistaken, answers(mistaken, rays)).harm.max() > 0
+    apart, alike = simulate(told_apart, rays), simulate(mistaken, rays)
+    assert (apart[0].body != target).any()
+    assert TASK.score(told_apart, apart).value < TASK.score(mistaken, alike).value
+    assert TASK.informs(told_apart, apart).harm.max() == 0
+    assert TASK.informs(mistaken, alike).harm.max() > 0
 
 
 def test_seen_counts_targets_and_frames_with_a_return(resting):
     (scene, *_) = resting(metric="seen", targets=("hand", "parcel"))
     target = next(i for i, body in enumerate(scene.bodies) if body.name == "hand")
-    returns = answers(scene, disc_rays(scene, target, [0.65, -1.0, 0.9], 50))
+    returns = simulate(scene, disc_rays(scene, target, [0.65, -1.0, 0.9], 50))
     assert TASK.score(scene, returns).value == pytest.approx(50.0)
     nothing = [Returns(one.rays, np.full(50, Outcome.MISS), one.range_m, np.full(50, -1), one.frame) for one in returns]
     assert TASK.score(scene, nothing).value == 0.0
 
 
 def test_a_surface_that_no_sensor_can_see_is_lost_and_tells_nothing(resting):
-    (scene, *_) = resting(metric="surface", mount_body="base", origin_m=(-0.2, 0.0, 0.0))
-    returns = answers(scene, rays_of_points(np.array([[-0.2, 0.0, 0.0, 0.0, 0.0, 1.0]]), (0.0, 10.0)))
+    (scene, *_) = resting(metric="surface", mount_body="base", origin_m=(-0.2, 0.0, 0.0), train=1, frames=2)
+    returns = simulate(scene, rays_of_points(np.array([[-0.2, 0.0, 0.0, 0.0, 0.0, 1.0]]), (0.0, 10.0)))
     assert TASK.score(scene, returns).failed
     told = TASK.informs(scene, returns)
-    require_valid(told, 1, 3)
+    require_valid(told, 1, 2)
     assert len(told.worth) == 0
 
 
@@ -475,14 +442,7 @@ REAL = {
         "targets": ("toe*",), "mount_body": "torso", "origin_m": (0.0, 0.0, -0.25), "metric": "seen",
     }),
     "a quadruped with a height field": ("dm_control", "suite/quadruped.xml", "", {"targets": ("terrain",)}),
-    "a humanoid": ("dm_control", "suite/humanoid.xml", "", {"targets": ("*hand",), "metric": "surface"}),
     "a hand of meshes": ("gymnasium_robotics", f"{ASSETS}/hand/reach.xml", ASSETS, {"targets": ("*ffdistal",)}),
-    "an arm with a gripper": ("gymnasium_robotics", f"{ASSETS}/fetch/pick_and_place.xml", ASSETS, {
-        "targets": ("*finger_link",),
-    }),
-    "an arm with seven joints": ("robosuite", "models/assets/robots/panda/robot.xml", "", {
-        "targets": ("link7",), "groups": (1,),
-    }),
 }  # fmt: skip
 
 
@@ -499,7 +459,7 @@ def test_targets_of_a_model_of_others_are_found_and_tell(name):
     generator, wanted = np.random.default_rng(0), [body for body in scene.bodies if body.is_target]
     seen = np.concatenate([sample_body(wanted, space, 500, generator, frame).points for frame in range(4)])
     points = aim(generator.uniform(space.low[:3], space.high[:3], seen.shape), seen)
-    returns = answers(scene, rays_of_points(points, (0.0, 1e3)))
+    returns = simulate(scene, rays_of_points(points, (0.0, 1e3)))
     targets = {index for index, body in enumerate(scene.bodies) if body.is_target}
     assert targets & set(np.concatenate([one.body for one in returns]).tolist())
     informed = TASK.informs(scene, returns)

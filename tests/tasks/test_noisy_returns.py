@@ -20,7 +20,6 @@ from lidardesign_tasks.warehouse import WarehouseTask
 from support.meshes import write_ball
 from support.rays import rays_along, rays_of_points
 
-from lidardesign.scenes.rays import Outcome
 from lidardesign.scenes.scene import Body, Box, Mesh, Scene, rigid
 from lidardesign.scoring.baselines.candidates import rays_at
 from lidardesign.scoring.scene_scores import checked_score, score_lists
@@ -87,26 +86,6 @@ def test_invented_returns_are_scored_as_returns_of_no_body(name, tmp_path):
     assert clean.failed or sign * score.value >= sign * clean.value
     invented = [turned(one, True, 0, one.rays.gate_m[:, 1] * 0.999) for one in returns]
     assert clean.failed or sign * checked_score(task, task.metric, scene, invented).value >= sign * clean.value
-
-
-def test_noise_is_not_told_from_the_ball_that_a_robot_carries():
-    task = ArmTask()
-    config = task.Config(**TASKS["arm"][1])
-    scene = scenes_of(task, config, "test", 0, task.space(config))[0]
-    ball = next(body for body in scene.bodies if body.is_target)
-    aside = np.eye(3)
-    places = np.stack([ball.pose(frame)[:3, 3] for frame in range(scene.frames)])
-    found = []
-    for frame, place in enumerate(places):
-        origins = place + aside
-        looking = (place - origins) / np.linalg.norm(place - origins, axis=1, keepdims=True)
-        rays = rays_along(looking, (0.0, 3.0), origins)
-        found.append(replace(simulate(Scene((ball,)), rays, casters=None)[frame], frame=frame))
-    index = scene.bodies.index(ball)
-    clean = [replace(one, body=np.where(one.returned, index, -1)) for one in found]
-    noisy = [turned(one, np.array([True, False, False]), Outcome.RETURN, 0.1) for one in clean]
-    assert task.score(scene, clean).value < 0.01
-    assert task.score(scene, noisy).value > 0.1
 
 
 @pytest.mark.parametrize("radius_m", [0.1, 3.0])

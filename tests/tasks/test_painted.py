@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 import trimesh
@@ -29,6 +27,10 @@ COLOURED = ("ply", "glb", "gltf", "obj")
 
 def ball(radius=1.0, subdivisions=2):
     return trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
+
+
+def arrays(mesh):
+    return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
 
 def save(mesh, path):
@@ -108,19 +110,11 @@ def test_a_property_that_is_not_there_is_answered_with_those_that_are(tmp_path):
     assert "ball.ply" in str(refused.value)
 
 
-@pytest.mark.parametrize(
-    ("paint", "words"),
-    [
-        (lambda mesh: None, "no colours"),
-        (
-            lambda mesh: setattr(mesh.visual, "face_colors", np.arange(len(mesh.faces) * 4).reshape(-1, 4) % 256),
-            "faces",
-        ),
-    ],
-)
-def test_a_file_without_vertex_colours_is_refused(tmp_path, paint, words):
+@pytest.mark.parametrize(("what", "words"), [("faces", "faces"), (None, "no colours")])
+def test_a_file_without_vertex_colours_is_refused(tmp_path, what, words):
     mesh = ball()
-    paint(mesh)
+    if what == "faces":
+        mesh.visual.face_colors = np.arange(len(mesh.faces) * 4).reshape(-1, 4) % 256
     with pytest.raises(DataError, match=words):
         load_mesh(save(mesh, tmp_path / "ball.ply"), painted=Painted("colours"))
 
@@ -148,17 +142,14 @@ def test_vertices_that_become_one_count_as_their_geometric_mean_and_lost_ones_no
 @pytest.mark.parametrize("radius", [0.05, 0.2])
 def test_the_roughness_of_a_ball_is_the_spread_of_heights_of_its_caps(radius):
     # a cap that a ball of radius r cuts is r^2 / (2 R) high, and evenly so in area (Archimedes)
-    made = ball(radius=1.0, subdivisions=5)
-    vertices = np.asarray(made.vertices)
-    found = vertex_roughness(vertices, np.asarray(made.faces), radius)
+    found = vertex_roughness(*arrays(ball(subdivisions=5)), radius)
     expected = radius**2 / 2 / np.sqrt(12)
     assert found.mean() == pytest.approx(expected, rel=0.05)
     assert found.std() < 0.15 * expected
 
 
 def test_roughness_is_that_of_the_surface_and_not_of_its_triangles():
-    made = ball(radius=1.0, subdivisions=4)
-    vertices, faces = np.asarray(made.vertices), np.asarray(made.faces)
+    vertices, faces = arrays(ball(radius=1.0, subdivisions=4))
     above = np.flatnonzero(vertices[faces].mean(axis=1)[:, 2] > 0)
     finer = trimesh.remesh.subdivide(vertices, faces, face_index=above)
     plain, found = vertex_roughness(vertices, faces, 0.3), vertex_roughness(*finer, 0.3)
@@ -167,8 +158,7 @@ def test_roughness_is_that_of_the_surface_and_not_of_its_triangles():
 
 
 def test_relative_roughness_knows_neither_units_nor_poses():
-    made = trimesh.creation.capsule(height=0.6, radius=0.2)
-    vertices, faces = np.asarray(made.vertices), np.asarray(made.faces)
+    vertices, faces = arrays(trimesh.creation.capsule(height=0.6, radius=0.2))
     plain = relative_roughness(vertices, faces, 0.1)
     turned = vertices @ rotation_matrix(np.array([0.3, -0.5, 0.2])).T + 2.0
     assert np.allclose(relative_roughness(turned, faces, 0.1), plain, rtol=1e-6)
@@ -186,8 +176,7 @@ def test_the_far_side_of_a_thin_plate_makes_it_no_rougher():
 
 
 def test_balls_too_small_to_measure_with_are_refused_with_the_least():
-    made = ball(radius=1.0)
-    vertices, faces = np.asarray(made.vertices), np.asarray(made.faces)
+    vertices, faces = arrays(ball(radius=1.0))
     with pytest.raises(ConfigError, match=r"(?s)roughness_radius_m.*at least 0\.016 m"):
         vertex_roughness(vertices, faces, 0.001)
     assert vertex_roughness(vertices, faces, 0.02).max() > 0
@@ -199,8 +188,7 @@ def test_a_surface_that_is_flat_everywhere_counts_evenly():
 
 
 def test_nothing_is_asked_for_by_default_and_the_exponent_is_one():
-    made = trimesh.creation.capsule(height=0.6, radius=0.2)
-    vertices, faces = np.asarray(made.vertices), np.asarray(made.faces)
+    vertices, faces = arrays(trimesh.creation.capsule(height=0.6, radius=0.2))
     assert Importance().weights(vertices, faces, SENSOR) is None
     once, twice = (
         Importance(roughness_exponent=e, roughness_radius_m=0.1).weights(vertices, faces, SENSOR) for e in (1.0, 2.0)
@@ -228,10 +216,10 @@ def test_rays_weighted_by_the_area_that_they_see_are_even_over_the_surface():
 
 
 def test_the_rim_of_a_ball_counts_no_more_than_tenfold():
-    made = ball(subdivisions=4)
-    found = relative_area(np.asarray(made.vertices), np.asarray(made.faces), np.array([1e4, 0.0, 0.0]))
+    vertices, faces = arrays(ball(subdivisions=4))
+    found = relative_area(vertices, faces, np.array([1e4, 0.0, 0.0]))
     # the middle of what is seen counts least, the rim ten times as much
-    cosine = np.abs(np.asarray(made.vertices)[:, 0])
+    cosine = np.abs(vertices[:, 0])
     relative = found / found.min()
     assert np.allclose(1 / relative, np.maximum(cosine, 0.1), atol=0.01)
     assert relative.max() == pytest.approx(10.0, rel=1e-3)
@@ -259,15 +247,11 @@ def test_a_region_counts_its_weight_inside_and_nothing_more_beyond_its_edge(shap
         {"region_edge_m": 0.02},
         {"region_centre_m": (0, 1e300, 0), "region_radius_m": 1.0},
         {"roughness_exponent": -1},
-        {"area_exponent": -0.1},
-        {"roughness_radius_m": 0},
-        {"region_weight": 0},
     ],
 )
-@pytest.mark.parametrize("kind", [FaceConfig, EmitterConfig, MeshesConfig])
-def test_half_a_region_and_impossible_numbers_are_refused(kind, keys):
+def test_half_a_region_and_impossible_numbers_are_refused(keys):
     with pytest.raises(ValidationError):
-        kind(**keys)
+        Importance(**keys)
 
 
 @pytest.mark.parametrize(("task", "kind"), [(FaceTask(), FaceConfig), (EmitterTask(), EmitterConfig)])
@@ -324,14 +308,3 @@ def test_a_region_beside_all_surfaces_is_refused_with_where_these_are(tmp_path):
 def test_a_contrast_without_colours_is_refused():
     with pytest.raises(ValidationError, match="importance=colours"):
         MeshesConfig(importance="care", colour_contrast=3.0)
-
-
-def test_gltf_text_that_names_weights_it_does_not_have_is_refused(tmp_path):
-    mesh = ball()
-    mesh.vertex_attributes["_care"] = np.ones(len(mesh.vertices), dtype=np.float32)
-    path = save(mesh, tmp_path / "ball.gltf")
-    document = json.loads(path.read_text())
-    document["meshes"][0]["primitives"][0]["attributes"]["_care"] = 999
-    path.write_text(json.dumps(document))
-    with pytest.raises(DataError, match=r"ball\.gltf"):
-        load_mesh(path, painted=Painted("_care"))

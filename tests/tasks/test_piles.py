@@ -14,9 +14,9 @@ from pydantic import ValidationError
 from scipy.optimize import linprog
 from scipy.spatial import ConvexHull
 from support.meshes import write_ball
+from support.rays import rays_of_points
 
 from lidardesign.errors import DataError
-from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Box, Mesh
 from lidardesign.simulate.returns import simulate
 from lidardesign.space import aim
@@ -56,10 +56,9 @@ def corners(placed):
 
 
 @each_kind
-@pytest.mark.parametrize("scale", [1.0, 10.0])
-def test_no_two_objects_overlap_by_a_millimetre_and_none_sinks_into_the_background(kind, scale):
+def test_no_two_objects_overlap_by_a_millimetre_and_none_sinks_into_the_background(kind):
     for seed in range(2):
-        background, placed = pile(kind, seed, scale=scale)
+        background, placed = pile(kind, seed)
         hulls = [corners(one) for one in placed]
         assert all(overlap_m(first, second) <= MILLIMETRE for first, second in combinations(hulls, 2))
         for half, centre in background.boxes():
@@ -69,7 +68,7 @@ def test_no_two_objects_overlap_by_a_millimetre_and_none_sinks_into_the_backgrou
 
 @each_kind
 def test_every_object_is_in_its_place(kind):
-    for seed in range(3):
+    for seed in range(2):
         background, placed = pile(kind, seed)
         low, high = background.bounds_m
         everything = np.concatenate([one.vertices for one in placed])
@@ -103,8 +102,8 @@ def test_the_same_seed_gives_the_same_bytes_and_another_one_another_pile(kind):
         settled_poses.cache_clear()
         return [one.vertices.tobytes() for one in pile(kind, seed)[1]]
 
-    assert bytes_of(3) == bytes_of(3)
-    assert bytes_of(3) != bytes_of(4)
+    first = bytes_of(1)
+    assert bytes_of(1) == first != bytes_of(0)
 
 
 def test_what_lies_on_a_table_was_put_there_upright_and_turned():
@@ -116,7 +115,7 @@ def test_what_lies_on_a_table_was_put_there_upright_and_turned():
 
 
 def test_piles_of_larger_objects_are_the_same_piles():
-    small, large = pile("bin", 2)[1], pile("bin", 2, scale=8.0)[1]
+    small, large = pile("bin", 1)[1], pile("bin", 1, scale=8.0)[1]
     for first, second in zip(small, large, strict=True):
         np.testing.assert_allclose(8 * first.vertices, second.vertices, atol=0.02)
 
@@ -126,9 +125,9 @@ def test_what_cannot_be_dropped_or_does_not_come_to_rest_is_one_message():
     with pytest.raises(DataError, match="flat"):
         background_of("bin", [flat], 1)
     box = mesh(SHAPES["box"])
-    low = replace(background_of("bin", [box], 8), highest_m=1e-3)
+    low = replace(background_of("bin", [box], 2), highest_m=1e-3)
     with pytest.raises(DataError, match=f"{ATTEMPTS} attempts"):
-        settled_poses((box,) * 8, low, 0)
+        settled_poses((box,) * 2, low, 0)
 
 
 @pytest.fixture(scope="module")
@@ -142,13 +141,12 @@ def folder(tmp_path_factory):
 @each_kind
 def test_random_rays_score_alike_with_and_without_the_background(folder, kind):
     task = MeshesTask()
-    config = task.Config(folder=folder, clutter=8, background=kind, poses=2, truth_points=1500)
+    config = task.Config(folder=folder, clutter=8, background=kind, poses=1, truth_points=1500)
     space = task.space(config)
     with_it, without, taken_for_it = [], [], []
     for scene in task.scenes(config, "test", 0, space):
         design = space.sample(361, np.random.default_rng(5))
-        gates = np.tile([0.0, space.high[5]], (len(design), 1))
-        rays = Rays.from_angles(design[:, :3], design[:, 3], design[:, 4], gates, np.zeros(len(design), dtype=int))
+        rays = rays_of_points(design, (0.0, space.high[5]))
         bare = replace(scene, bodies=tuple(body for body in scene.bodies if body.is_target))
         with_it.append(task.score(scene, simulate(scene, rays)).value)
         without.append(task.score(bare, simulate(bare, rays)).value)
@@ -164,8 +162,7 @@ def test_returns_on_the_background_tell_nothing_and_spoil_nothing(folder):
     space = task.space(config)
     scene = task.scenes(config, "train", 0, space)[0]
     design = space.sample(2000, np.random.default_rng(1))
-    gates = np.tile([0.0, space.high[5]], (len(design), 1))
-    rays = Rays.from_angles(design[:, :3], design[:, 3], design[:, 4], gates, np.zeros(len(design), dtype=int))
+    rays = rays_of_points(design, (0.0, space.high[5]))
     information = task.informs(scene, simulate(scene, rays))
     assert len(information.ray)
     assert not information.harm.any()
@@ -177,7 +174,7 @@ def test_returns_on_the_background_tell_nothing_and_spoil_nothing(folder):
 def test_a_pile_shows_the_mesh_of_its_scene_and_others_of_its_split_alone(folder):
     task = MeshesTask()
     for count in (1, 2, 7):
-        config = task.Config(folder=folder, clutter=count, poses=2, truth_points=100)
+        config = task.Config(folder=folder, clutter=count, poses=1, truth_points=100)
         shown = {}
         for split in ("train", "test"):
             for scene in task.scenes(config, split, 0):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -13,7 +12,7 @@ import typer
 from lidardesign.cli.terminal import options
 from lidardesign.cli.terminal.grids import RichConsole
 from lidardesign.cli.terminal.options import words
-from lidardesign.cli.terminal.output import Output, claim_outputs, command, keep_times
+from lidardesign.cli.terminal.output import claim_outputs, command, keep_times
 from lidardesign.cli.terminal.score_tables import show_accuracy, show_evaluation
 from lidardesign.run.clock import phase
 from lidardesign.run.outputs import check_outputs
@@ -217,7 +216,10 @@ def evaluate(
         )
         files = {"--report": report, "--csv": csv}
         check_outputs(files, targets)
-        scores = _score(request, output)
+        with output.progress("evaluating") as progress:
+            scores = request.score(
+                lambda scene, done, total: progress.show(done, total), search_display(request, progress)
+            )
         written: dict[Path, None] = {}
 
         def show_result() -> None:
@@ -229,7 +231,9 @@ def evaluate(
                     show_accuracy(scores.evaluation.accuracy, rich, verbose=output.verbose)
                 show_evaluation({**document, "notes": notes}, scores.evaluation, rich, verbose=output.verbose)
 
-            output.result(document, show, files={_kind(path, files): path for path in written})
+            output.result(
+                document, show, files={name.removeprefix("--"): path for name, path in files.items() if path in written}
+            )
 
         with ExitStack() as rest:  # the scores are shown whatever becomes of the files and of what is measured further
             rest.callback(show_result)
@@ -237,14 +241,10 @@ def evaluate(
             # accuracy takes minutes: what was scored by then is written already
             _write_files(scores, written, *files.values())
             if accuracy:
-                scores = _with_accuracy(scores, output)
+                with output.progress("measuring accuracy") as progress:
+                    scores = scores.with_accuracy(lambda sweep, done, total: progress.show(done, total, detail=sweep))
                 _write_files(scores, written, *files.values())
         check_scores(scores)
-
-
-def _score(request: ScoreRequest | SeedsRequest, output: Output) -> Scores:
-    with output.progress("evaluating") as progress:
-        return request.score(lambda scene, done, total: progress.show(done, total), search_display(request, progress))
 
 
 def search_display(request: ScoreRequest | SeedsRequest, progress: ProgressDisplay) -> Show:
@@ -258,11 +258,6 @@ def search_display(request: ScoreRequest | SeedsRequest, progress: ProgressDispl
     return show
 
 
-def _with_accuracy(scores: Scores, output: Output) -> Scores:
-    with output.progress("measuring accuracy") as progress:
-        return scores.with_accuracy(lambda sweep, done, total: progress.show(done, total, detail=sweep))
-
-
 @phase("writing")
 def _write_files(scores: Scores, written: dict[Path, None], report: Path | None, csv: Path | None) -> None:
     """Write what was asked for, each whatever becomes of the other; what is there then is added to `written`."""
@@ -272,11 +267,6 @@ def _write_files(scores: Scores, written: dict[Path, None], report: Path | None,
         if csv is not None:
             scores.to_csv(csv)
             written[csv] = None
-
-
-def _kind(path: Path, files: Mapping[str, Path | None]) -> str:
-    """The option, without its dashes, that a written file was asked for by."""
-    return next(option.removeprefix("--") for option, given in files.items() if given == path)
 
 
 def _write_report(scores: Scores, written: dict[Path, None], path: Path) -> None:

@@ -301,6 +301,8 @@ def describe_error(error: BaseException, output: Output) -> tuple[dict[str, Any]
     if lacks_memory(error):
         text = "the computer ran out of memory; a smaller batch, field_resolution or preset needs less"
         return {"kind": "memory", "message": text}, NumericalError.exit_code, f"memory error: {text}"
+    if isinstance(error, RuntimeError) and str(error).startswith("Symlink loop"):  # of `Path.resolve`
+        error = OSError(errno.ELOOP, str(error))
     if isinstance(error, OSError):
         name = f"{error.filename}: " if error.filename else ""
         document = {"kind": "system", "message": f"{name}{error.strerror or error}"}

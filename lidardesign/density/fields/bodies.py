@@ -192,7 +192,7 @@ def occluding_bodies(scenes: Sequence[Scene]) -> Bodies:
         for body in scene.bodies
         if body.is_occluder
     ]
-    return place_bodies(entries, len(columns), _no_distances)
+    return place_bodies(entries, len(columns), no_distances)
 
 
 def own_grid(mesh: Mesh, resolution: int, padding_m: float) -> tuple[Grid, np.ndarray]:
@@ -201,7 +201,8 @@ def own_grid(mesh: Mesh, resolution: int, padding_m: float) -> tuple[Grid, np.nd
     return grid, cached_distance_grids([mesh], grid)[0]
 
 
-def _no_distances(mesh: Mesh) -> tuple[Grid, np.ndarray]:
+def no_distances(mesh: Mesh) -> tuple[Grid, np.ndarray]:
+    """A grid around a mesh whose distances nobody asks for."""
     return grid_around(mesh.bounds_m, 2, 0.0), np.zeros(0, dtype=np.float32)
 
 

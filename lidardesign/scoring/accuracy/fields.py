@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 
 from lidardesign.config import DensitySettings
-from lidardesign.density.fields.bodies import place_bodies
+from lidardesign.density.fields.bodies import no_distances, place_bodies
 from lidardesign.density.fields.distance import BodyField, Field, TableField, scene_columns
 from lidardesign.density.fields.grids import distance_grid, grid_around
 from lidardesign.density.fields.importance import build_log_weights
@@ -188,16 +188,12 @@ def exact_distances(scenes: Sequence[Scene], points: np.ndarray) -> np.ndarray:
         (meshes if isinstance(entry[1].shape, Mesh) else others).append(entry)
     out = np.full((len(points), columns), np.inf)
     if others:
-        out = BodyField(place_bodies(others, columns, _no_grid)).distances(points)
+        out = BodyField(place_bodies(others, columns, no_distances)).distances(points)
     for column, body, frame in meshes:
         to_body = inverse_rigid(body.pose(frame))
         local = points @ to_body[:3, :3].T + to_body[:3, 3]
         out[:, column] = np.minimum(out[:, column], mesh_distances(body.shape, local))
     return out
-
-
-def _no_grid(mesh: Mesh) -> tuple:
-    raise AssertionError("meshes are asked exactly")
 
 
 def mesh_distances(mesh: Mesh, points: np.ndarray) -> np.ndarray:

@@ -274,7 +274,22 @@ def render_transient(
     }
     request = {"shapes": shapes, "samples": samples, "bins": bins.count, "width_m": bins.width_m}
     request |= {"bounces": bounces, "own": own_light}
-    arrays |= (light_columns := _light_columns(lights, centre_m, reach_m))
+    light_columns = {
+        "light": lights.origin_m - centre_m,
+        "light_forward": lights.axes[:, 0],
+        "light_left": lights.axes[:, 1],
+        "light_up": lights.axes[:, 2],
+        "light_cosine": lights.least_cosine,
+        "light_left_tan": lights.tangents[:, 0],
+        "light_up_tan": lights.tangents[:, 1],
+        "light_lambert": lights.lambertian.astype(float),
+        "light_intensity": lights.intensity,
+        "light_radius": lights.radius_m,
+        # a patch does not light itself
+        "light_itself": np.where(lights.lambertian, SAME_PLACE * reach_m, 0.0),
+        "light_lead": lights.lead_m,
+    }
+    arrays |= light_columns
     by_ray = columns | (light_columns if own_light else {})
     # the answers of all requests, without the padding rays of the last
     parts = []
@@ -297,24 +312,6 @@ def _neighbourhood(first: Hits, rays: Rays, lights: Lights) -> tuple[np.ndarray,
     points = np.concatenate([points, rays.origin_m, lights.origin_m])
     centre_m = (points.min(axis=0) + points.max(axis=0)) / 2
     return centre_m, float(np.linalg.norm(points - centre_m, axis=1).max())
-
-
-def _light_columns(lights: Lights, centre_m: np.ndarray, reach_m: float) -> dict[str, np.ndarray]:
-    return {
-        "light": lights.origin_m - centre_m,
-        "light_forward": lights.axes[:, 0],
-        "light_left": lights.axes[:, 1],
-        "light_up": lights.axes[:, 2],
-        "light_cosine": lights.least_cosine,
-        "light_left_tan": lights.tangents[:, 0],
-        "light_up_tan": lights.tangents[:, 1],
-        "light_lambert": lights.lambertian.astype(float),
-        "light_intensity": lights.intensity,
-        "light_radius": lights.radius_m,
-        # a patch does not light itself
-        "light_itself": np.where(lights.lambertian, SAME_PLACE * reach_m, 0.0),
-        "light_lead": lights.lead_m,
-    }
 
 
 def _chunks(count: int, bins: int) -> list[np.ndarray]:
