@@ -36,9 +36,7 @@ CASES = {
     "along": {"sensors": 1},
     "at one place": {"sensors": 1, "at": {"x_m": 0.4}},
 }
-
-
-SAMPLES = 20_000
+SAMPLES = 3000
 
 
 @pytest.fixture(autouse=True)
