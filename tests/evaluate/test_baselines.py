@@ -117,7 +117,6 @@ def test_bounding_from_the_ceiling_looks_straight_down_where_that_returns_more()
 def test_a_judge_decides_between_the_candidates_of_bounding():
     space, train = CASES["ceiling"]
 
-
     def judge(sign):
         return lambda lists: [sign * abs(rays.direction[:, 2]).mean() for (rays,) in lists]
 

@@ -12,7 +12,7 @@ from support.rays import rays_along
 from support.sensors import normal_sensor
 
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.formats.galvo import degree_frame, read_galvo, scan_directions, write_galvo
+from lidardesign.formats.galvo import degree_frame, scan_directions, write_galvo
 from lidardesign.scoring.captures import scan as capture_ranges
 from lidardesign.scoring.captures.capture import Capture, load_capture
 from lidardesign.scoring.captures.scan import (

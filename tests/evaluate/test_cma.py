@@ -24,7 +24,6 @@ from lidardesign.scoring.baselines.candidates import rays_at
 from lidardesign.scoring.baselines.cma import CmaCandidate, CmaSettings, MovableSensors
 from lidardesign.scoring.baselines.views import TrainingObjective
 from lidardesign.scoring.evaluation.entries import entries_of
-from lidardesign.scoring.evaluation.request import EvaluationRequest
 from lidardesign.scoring.evaluation.score import evaluate
 from lidardesign.sensors.adaptive import mean_mbps
 from lidardesign.sensors.bandwidth import Bandwidth
@@ -32,7 +31,6 @@ from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.pattern import Pattern, even_rays
 from lidardesign.simulate.plan import Planner
 from lidardesign.space import DesignSpace, angles
-from lidardesign.task import TaskConfig
 
 FIXED = DesignSpace((0, 0, 0, -0.5, -0.5, 0.05), (0, 0, 0, 0.5, 0.5, 4.0))
 FREE = DesignSpace((-0.2, -0.2, -0.2, -0.6, -0.5, 0.05), (0.2, 0.2, 0.2, 0.6, 0.5, 4.0))

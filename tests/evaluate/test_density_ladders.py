@@ -56,7 +56,9 @@ def hidden_wall(place, kind=Box):
 
 def balls(count, seed=0):
     places = np.random.default_rng(seed).uniform((1.9, -0.2, -0.2), (2.1, 0.2, 0.2), (count, 3))
-    return [Scene((Body(icosphere(0.3, subdivisions=3), "ball", "both", rigid(translation_m=place)),)) for place in places]
+    return [
+        Scene((Body(icosphere(0.3, subdivisions=3), "ball", "both", rigid(translation_m=place)),)) for place in places
+    ]
 
 
 def moving_ball(frames):

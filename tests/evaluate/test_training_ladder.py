@@ -52,7 +52,9 @@ def runs(tmp_path_factory):
 def request_for(run):
     task, config = load_run_config(run)
     train, test = (scenes_of(task, config.task, split, config.seed, config.space) for split in ("train", "test"))
-    asked = EvaluationRequest(task, config.task, config.space, config.seed, (), [12], train=list(train), test=list(test))
+    asked = EvaluationRequest(
+        task, config.task, config.space, config.seed, (), [12], train=list(train), test=list(test)
+    )
     return AccuracyRequest(config, run, asked, None)
 
 
