@@ -38,6 +38,7 @@ from lidardesign.space import DesignSpace
 
 SPACE = DesignSpace((0, 0, 0, -0.35, -0.35, 0.5), (0, 0, 0, 0.35, 0.35, 3.5))
 SETTINGS = DensitySettings(sigma_m=0.02)
+BALL = icosphere(0.3, subdivisions=3)
 pytestmark = pytest.mark.usefixtures("own_cache")
 
 
@@ -56,9 +57,7 @@ def hidden_wall(place, kind=Box):
 
 def balls(count, seed=0):
     places = np.random.default_rng(seed).uniform((1.9, -0.2, -0.2), (2.1, 0.2, 0.2), (count, 3))
-    return [
-        Scene((Body(icosphere(0.3, subdivisions=3), "ball", "both", rigid(translation_m=place)),)) for place in places
-    ]
+    return [Scene((Body(BALL, "ball", "both", rigid(translation_m=place)),)) for place in places]
 
 
 def moving_ball(frames):
@@ -247,7 +246,7 @@ class TestFieldSweeps:
         monkeypatch.setattr(fields, "PROBES", 512)
         monkeypatch.setattr(fields, "RESOLUTIONS", (12, 48))
         poses = np.stack([rigid(translation_m=(2.0, y, 0)) for y in (-0.1, 0.0, 0.1)])
-        scene = Scene((Body(icosphere(0.3, subdivisions=3), poses=poses),))
+        scene = Scene((Body(BALL, poses=poses),))
         case = fields.FieldCase.of([scene], SPACE, DensitySettings(sigma_m=0.02, field_resolution=48), 0, "off")
         sweep = fields.resolution_sweep(case)
         assert sweep.measurements[0].error > sweep.measurements[1].error

