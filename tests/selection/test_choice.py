@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from support.coverages import SUMS, relaxed_by_highs, small
 
@@ -79,17 +79,23 @@ class TestAChoice:
                 assert gains[name][ray, choice] == pytest.approx(gain, abs=1e-12)
         assert (gains["more"][2:] <= gains["few"][2:] + 1e-12).all()
 
-    @given(seed=seeds, price=st.sampled_from([0.0, 0.05, 0.3]), most=st.integers(1, 3))
-    def test_is_near_the_best_of_all_and_its_certificate_above_it(self, table, seed, price, most):
+    @given(
+        seed=seeds, price=st.sampled_from([0.0, 0.05, 0.3]), most=st.integers(1, 3),
+        share=st.none() | st.floats(0.1, 1.2),
+    )  # fmt: skip
+    def test_is_not_above_the_best_of_all_and_its_certificate_not_below(self, table, seed, price, most, share):
         coverage, counts = small(seed, table=table, harm=0.05), RayCounts(np.arange(7) % 2, np.array([most, 1]))
-        choice = choose(coverage, counts, price=price, full=False)
-        best = best_of_all(coverage, every_choice(coverage, counts), price)
-        certificate = certify(coverage, counts, choice, full=False)
+        choice, budget = choose(coverage, counts, price=price, full=False), None
+        if share is not None:
+            price, budget = 0.0, share * choose(coverage, counts).bits
+            choice = choose_within(coverage, counts, budget, full=False)
+            assert choice.bits <= budget
+        best = best_of_all(coverage, every_choice(coverage, counts), price, np.inf if budget is None else budget)
+        certificate = certify(coverage, counts, choice, budget_mbps=budget, full=False)
         assert certificate.value <= best + 1e-12
         assert certificate.bound >= best - 1e-12
         assert (np.bincount(counts.group[choice.rays], minlength=2) <= counts.most).all()
 
-    @settings(max_examples=60)
     @given(
         seed=seeds, harm=st.sampled_from([0.05, 0.5, 3.0]), price=st.sampled_from([0.0, 0.05]),
         share=st.none() | st.floats(0.5, 1.2), owned=st.booleans(), most=st.integers(2, 9), banned=st.booleans(),
@@ -122,28 +128,14 @@ class TestAChoice:
         assert 0.1 + 0.1 + 0.1 > 0.3
         assert len(choose_within(coverage, RayCounts.of_one(len(coverage.bits), 3), 0.3).rays) == 3
 
-    @given(seed=seeds, share=st.floats(0.1, 1.2))
-    def test_within_a_budget_is_near_the_best_of_all_and_its_certificate_above_it(self, table, seed, share):
-        coverage, counts = small(seed, table=table), RayCounts.of_one(7, 3)
-        budget = share * choose(coverage, counts).bits
-        choice = choose_within(coverage, counts, budget, full=False)
-        best = best_of_all(coverage, every_choice(coverage, counts), budget_mbps=budget)
-        certificate = certify(coverage, counts, choice, budget_mbps=budget, full=False)
-        assert choice.bits <= budget
-        assert choice.worth <= best + 1e-12
-        assert certificate.bound >= best - 1e-12
-
     @pytest.mark.parametrize(("price", "share"), [(0.0, None), (0.05, None), (0.0, 0.5)])
     def test_loses_little_against_the_best_of_all(self, table, price, share):
         ratios = []
-        for seed in range(30):
+        for seed in range(15):
             coverage, counts = small(seed, table=table), RayCounts.of_one(7, 3)
             budget = np.inf if share is None else share * choose(coverage, counts).bits
-            choice = (
-                choose_within(coverage, counts, budget, full=False)
-                if share
-                else choose(coverage, counts, price=price, full=False)
-            )
+            choice = choose(coverage, counts, price=price, full=False)
+            choice = choose_within(coverage, counts, budget, full=False) if share else choice
             best = best_of_all(coverage, every_choice(coverage, counts), price, budget)
             ratios.append((choice.worth - price * choice.bits) / best)
         assert np.mean(ratios) >= 0.98
@@ -277,10 +269,6 @@ def test_of_what_a_ray_tells_in_several_frames_the_largest_counts_that_a_gate_le
         assert coverage.gains(np.zeros(items))[one, gate] == pytest.approx(most.mean(), rel=1e-6)
 
 
-def test_tables_of_sums_are_concave_but_for_rounding():
-    assert small(0, table=np.arange(6) / 5).complete > 0
-
-
 @pytest.mark.parametrize(
     ("table", "says"), [([1.0, 2.0], "0 at 0"), ([0.0, 1.0, 0.5], "never falling"), ([0.0, 1.0, 3.0], "faster")]
 )
@@ -288,3 +276,4 @@ def test_tables_of_sums_that_are_not_concave_are_refused(table, says):
     with pytest.raises(PluginError, match="informs") as refusal:
         small(0, table=np.array(table))
     assert says in str(refusal.value)
+    assert small(0, table=np.arange(6) / 5).complete > 0  # concave but for rounding
