@@ -27,7 +27,7 @@ with warnings.catch_warnings():
 
 pytestmark = [
     # what dask.distributed leaves to be collected at the end of a test is not ours to close
-    pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning:(distributed|tornado|dask).*"),
+    pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning:(distributed|tornado|dask).*")
 ]
 PATIENCE_S = 60.0
 

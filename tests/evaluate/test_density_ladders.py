@@ -19,13 +19,7 @@ from lidardesign.density.coordinates import Coordinates
 from lidardesign.density.fields.distance import build_field
 from lidardesign.density.network import DesignFlow
 from lidardesign.density.objective.target import build_target
-from lidardesign.density.training.learned import (
-    LearningSteps,
-    gradient,
-    in_arithmetic,
-    noise_share,
-    noise_shares,
-)
+from lidardesign.density.training.learned import LearningSteps, gradient, in_arithmetic, noise_share, noise_shares
 from lidardesign.density.training.losses import Pool
 from lidardesign.density.training.quality import misplaced_share
 from lidardesign.errors import NumericalError

@@ -8,13 +8,7 @@ import pytest
 from scipy.special import ndtr
 from support.sensors import normal_sensor
 
-from lidardesign.report.density_views import (
-    PERCENT,
-    density_view,
-    marginals,
-    mixture_points,
-    silhouette,
-)
+from lidardesign.report.density_views import PERCENT, density_view, marginals, mixture_points, silhouette
 from lidardesign.samples import Samples
 from lidardesign.scenes.scene import Body, Box, Plane, Scene, Sphere, rigid
 from lidardesign.sensors.design import DesignSpec

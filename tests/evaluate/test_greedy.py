@@ -201,11 +201,7 @@ def test_an_evaluation_has_it_at_each_number_of_rays_in_no_more_bandwidth_than_t
 
 @pytest.mark.parametrize(
     ("changes", "note"),
-    [
-        ({"task": MissTask()}, "no method informs"),
-        ({"rays": (5, 40)}, "above 30 rays"),
-        ({"training": None}, None),
-    ],
+    [({"task": MissTask()}, "no method informs"), ({"rays": (5, 40)}, "above 30 rays"), ({"training": None}, None)],
 )
 def test_it_is_left_out_with_one_note_where_rays_cannot_be_chosen(monkeypatch, changes, note):
     monkeypatch.setattr(greedy_module, "MOST_CHOSEN", 30)

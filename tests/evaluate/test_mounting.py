@@ -45,8 +45,7 @@ def test_errors_are_read_in_their_units(text, place_m, angle_rad):
 
 
 @pytest.mark.parametrize(
-    "text",
-    ["", "5", "5 miles", "mm", "-1mm", "nan mm", "5mm,6mm", "1deg,2rad", "5mm 1deg", "200deg", "1e99m"],
+    "text", ["", "5", "5 miles", "mm", "-1mm", "nan mm", "5mm,6mm", "1deg,2rad", "5mm 1deg", "200deg", "1e99m"]
 )
 def test_what_is_no_error_is_refused_with_what_is(text):
     with pytest.raises(ConfigError, match="--mount-error") as caught:

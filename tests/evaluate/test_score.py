@@ -220,15 +220,7 @@ class BrokenTask(MissTask):
 
 @pytest.mark.parametrize(
     "result",
-    [
-        ValueError("boom"),
-        SystemExit(0),
-        None,
-        Score(float("nan")),
-        Score("3"),
-        Score(True),
-        Score(-1e9),
-    ],
+    [ValueError("boom"), SystemExit(0), None, Score(float("nan")), Score("3"), Score(True), Score(-1e9)],
     ids=str,
 )
 def test_a_broken_score_is_a_plugin_error_naming_task_metric_and_scene(result):

@@ -65,12 +65,7 @@ def sweeps(runs):
 
 @pytest.mark.parametrize(
     ("sweeps_of", "count"),
-    [
-        (fields.visibility_sweeps, 1),
-        (fields.field_sweeps, 0),
-        (training.dtype_sweeps, 1),
-        (training.frames_sweeps, 1),
-    ],
+    [(fields.visibility_sweeps, 1), (fields.field_sweeps, 0), (training.dtype_sweeps, 1), (training.frames_sweeps, 1)],
 )
 def test_sweeps_of_a_run_have_errors_that_fall(runs, sweeps_of, count, monkeypatch, own_cache):
     monkeypatch.setattr(fields, "VISIBILITY_PROBES", 2048)
