@@ -168,7 +168,7 @@ def test_the_program_audits_and_exits_with_1_only_where_scores_move(lidardesign,
 
 
 def test_the_program_judges_by_other_surroundings_than_were_learned(lidardesign, fitted):
-    options = ("evaluate", fitted, "--rays", 8, "--detector", "single-photon", "--effects", "auto")
+    options = ("evaluate", fitted, "--rays", 8, "--baseline", "uniform", "--detector", "single-photon")
     room = lidardesign(*options, "--json").json
     sunny = lidardesign(*options, "--set", "illuminance_lux=100000", "--set", "light=sun", "-v")
     assert sunny.code == 0

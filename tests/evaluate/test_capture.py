@@ -197,9 +197,7 @@ def test_a_single_pixel_needs_an_angle(clean):
     with pytest.raises(ConfigError, match="--within-deg"):
         default_within_rad(one)
     assert uniform_rays(one, 4).direction == pytest.approx(np.repeat(clean.direction[:1], 4, axis=0))
-
-
-def test_pixels_that_were_captured_twice_are_as_far_apart_as_before(clean):
+    # pixels that were captured twice are as far apart as before
     counts, looks = (np.repeat(one, 2, axis=0) for one in (clean.counts, clean.direction))
     twice = Capture(counts, BIN_PS, START_PS, np.zeros(3), looks)
     assert twice.spacing_rad == pytest.approx(clean.spacing_rad, rel=1e-6)
@@ -218,12 +216,10 @@ def test_uniform_rays_of_a_square_capture_are_its_pixels(clean):
     assert sorted(found.pixel) == list(range(31 * 31))
 
 
-@pytest.mark.parametrize("count", [1, 7, 100, 576])
+@pytest.mark.parametrize("count", [1, 7, 576])
 def test_uniform_rays_are_as_many_as_asked_for_and_all_captured(clean, count):
-    rays = uniform_rays(clean, count)
-    assert len(rays) == count
-    found = scan(clean, rays, default_within_rad(clean), Estimation())
-    assert (found.captured == Captured.YES).all()
+    found = scan(clean, uniform_rays(clean, count), default_within_rad(clean), Estimation())
+    assert found.captured.tolist() == [Captured.YES] * count
 
 
 def test_a_gated_capture_knows_nothing_of_rays_without_gates(clean):
@@ -346,13 +342,8 @@ def test_the_program_scores_designs_and_their_exports_side_by_side(call, tmp_pat
     point = next(line for line in lines if line["range_m"])
     place = np.array([float(point[f"point_{axis}_m"]) for axis in "xyz"])
     assert np.linalg.norm(place) == pytest.approx(float(point["range_m"]))
-
-
-def test_the_table_names_its_judges(call):
-    done = call("capture", "untrue.npz", "ball.yaml", "--outlier-mm", "5")
-    assert done.code == 0
-    assert "5 mm from the median range of the 9 nearest pixels" in done.out
-    assert "uniform" in done.out
+    # the table names its judges
+    assert "5 mm from the median range" in call("capture", "untrue.npz", "ball.yaml", "--outlier-mm", "5").out
 
 
 BAD = [

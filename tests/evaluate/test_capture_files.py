@@ -233,17 +233,13 @@ def test_a_file_that_was_cut_short_is_refused(tmp_path, kind, share):
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".mat"])
-def test_garbage_a_folder_and_nothing_are_refused(tmp_path, suffix):
+def test_garbage_and_nothing_are_refused(tmp_path, suffix):
     path = tmp_path / f"s{suffix}"
     with pytest.raises(DataError, match="No such file"):
         load_capture(path)
     path.write_bytes(bytes(range(256)) * 16)
     with pytest.raises(DataError):
         load_capture(path)
-    folder = tmp_path / f"folder{suffix}"
-    folder.mkdir()
-    with pytest.raises(DataError, match="it is a folder"):
-        load_capture(folder)
     with pytest.raises(DataError, match=r"suffix '.csv'.*\n.*\.npz, \.mat"):
         load_capture(tmp_path / "s.csv")
 
@@ -258,9 +254,6 @@ def test_files_above_the_stated_size_are_refused_before_they_are_read(tmp_path, 
         assert path.stat().st_size < 100_000, "packed, it is small"
         with pytest.raises(DataError, match="unpacked data take"):
             load_capture(path)
-    (tmp_path / "big.npz").write_bytes(bytes(100_001))
-    with pytest.raises(DataError, match="the file is too large"):
-        load_capture(tmp_path / "big.npz")
 
 
 def test_what_is_no_array_in_an_archive_is_refused(tmp_path):

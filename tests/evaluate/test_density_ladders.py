@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from types import SimpleNamespace
 
@@ -249,37 +248,6 @@ class TestFieldSweeps:
     def test_primitives_need_no_field(self):
         request = SimpleNamespace(config=None, request=SimpleNamespace(train=[hidden_wall((1.5, 0, 0))]))
         assert fields.field_sweeps(request) == []
-
-
-class TestDrawnScenes:
-    def test_the_mean_over_all_choices_is_the_density_of_all(self):
-        every = balls(4)
-        target = build_target(every, SPACE, SETTINGS, "raycast")
-        points = draw_probes(target, 200, 0, "test").points
-        # culled by other best terms, scenes that are left out add less than exp(-16) of the largest term
-        means = [
-            np.exp(target.subsample(np.array(chosen)).log_density(points))
-            for chosen in itertools.combinations(range(4), 2)
-        ]
-        assert np.mean(means, axis=0) == pytest.approx(np.exp(target.log_density(points)), rel=1e-5, abs=1e-7)
-
-    def test_scenes_that_were_not_drawn_are_not_looked_at(self):
-        every = balls(3)
-        target = build_target(every, SPACE, SETTINGS, "raycast")
-        seen = []
-        way = target.visibility.transmittance
-
-        def watched(rays, active, *args, **options):
-            seen.append(active)
-            return way(rays, active, *args, **options)
-
-        target.visibility.transmittance = watched
-        points = draw_probes(target, 100, 0, "test").points
-        values, slopes = target.subsample(np.array([1])).log_density_and_gradient(points)
-        assert np.isfinite(values).all()
-        assert np.isfinite(slopes).all()
-        assert not seen[0][:, [0, 2]].any()
-        assert seen[0][:, 1].all()
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
 
@@ -13,6 +12,7 @@ from support.command_line import make_run
 from support.scoring import design, make_request, rows_by_key, scenes
 from support.workers import random_rays
 
+from lidardesign.api.run import open_run
 from lidardesign.errors import ConfigError
 from lidardesign.estimates import paired_difference
 from lidardesign.report.tables import mounting_table
@@ -137,10 +137,9 @@ def test_over_seeds_rows_and_costs_are_means():
 
 def test_the_command_shows_what_careless_mounting_costs(lidardesign, tmp_path):
     run = make_run(tmp_path / "run", count=1000)
-    lidardesign("fit", run, "--layout", "even", "--sensors", 2, "--name", "two")
-    found = lidardesign("evaluate", run, "--rays", 16, "--set", "test=2", "--mount-error", "5mm,0.5deg", "--json")
-    mounting = json.loads(found.out)["mounting"]
+    open_run(run).fit(layout="even", sensors=2, name="two").save()
+    options = ("evaluate", run, "--rays", 16, "--set", "test=2", "--baseline", "uniform", "--mount-error")
+    mounting = lidardesign(*options, "5mm,0.5deg", "--json").json["mounting"]
     assert (mounting["place_m"], mounting["angle_rad"]) == pytest.approx((0.005, 0.5 * DEGREE))
     assert mounting["rows"][0]["design"] == "two"
-    shown = lidardesign("evaluate", run, "--rays", 16, "--set", "test=2", "--mount-error", "5mm").out
-    assert "off by 5 mm" in shown
+    assert "off by 5 mm" in lidardesign(*options, "5mm").out

@@ -45,7 +45,7 @@ def test_a_design_without_the_middle_number_of_rays_is_shown_at_the_closest():
 
 def test_without_baselines_every_design_has_its_score():
     text = result_section(evaluation_of(baseline=None), [])
-    assert "f: 5 mm at 25 rays." in text
+    assert "f: 5.00 mm at 25 rays." in text
     assert "difference" not in text
 
 

@@ -13,11 +13,13 @@ from lidardesign.errors import ConfigError, DataError, PluginError
 from lidardesign.estimates import mean_interval, paired_difference
 from lidardesign.report.figures import scores_figure
 from lidardesign.report.tables import paired_tables
+from lidardesign.scenes.rays import Rays
+from lidardesign.scenes.scene import rigid
 from lidardesign.scoring.baselines import candidates
 from lidardesign.scoring.evaluation.entries import FEWEST_BASELINE_SCENES
 from lidardesign.scoring.evaluation.results import csv_text, verdict
 from lidardesign.scoring.evaluation.score import evaluate
-from lidardesign.scoring.evaluation.thresholds import worse_than_threshold
+from lidardesign.scoring.scene_scores import silent_notes
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.space import DesignSpace
 from lidardesign.task import Score
@@ -285,12 +287,42 @@ def test_requests_that_make_no_sense_are_refused(changes, message):
         evaluate(make_request(designs, **changes))
 
 
-def test_a_threshold_knows_which_way_is_better():
-    evaluation = evaluate(make_request())
-    aimed = rows_by_key(evaluation)["aimed", 9].value
-    best = min(row.value for row in evaluation.rows if row.design == "aimed")
-    assert {row.design for row in worse_than_threshold(evaluation, best - 1e-9)} == {"aimed"}
-    assert not worse_than_threshold(evaluation, 150.0)
-    upward = replace(evaluation, metric=HitTask.metric)
-    assert not worse_than_threshold(upward, best)
-    assert worse_than_threshold(upward, aimed + 1e-9)
+def silent(evaluation):
+    return [note for note in evaluation.notes if "returns from a target" in note]
+
+
+def rays_ahead(gate_m=(0.05, 4.0), azimuth=0.0):
+    gates_m = np.tile(gate_m, (2, 1))
+    return Rays.from_angles(np.zeros((2, 3)), np.full(2, azimuth), np.zeros(2), gates_m, np.zeros(2, int))
+
+
+@pytest.mark.parametrize("azimuth", [0.0, 0.45])
+def test_an_evaluation_names_designs_that_look_past_the_targets(azimuth):
+    found = silent(evaluate(make_request([design(), design("other", azimuth=azimuth)])))
+    assert [note.split(",")[1].split(" returns")[0] for note in found] == ([" no ray of 'other'"] if azimuth else [])
+
+
+@pytest.mark.parametrize(
+    ("rays", "expected"),
+    [
+        (rays_ahead(), False),
+        (rays_ahead(azimuth=1.0), True),
+        (rays_ahead((50.0, 4000.0)), True),
+        (rays_ahead((0.05, 1.0)), True),
+        (rays_ahead().subset(np.array([], dtype=int)), True),
+    ],
+    ids=["ahead", "aside", "in millimetres", "gate too near", "no rays"],
+)
+def test_rays_are_silent_where_no_gate_holds_a_target(rays, expected):
+    assert bool(silent_notes(scenes(1), {"looking": (rays,)})) == expected
+
+
+def test_what_returns_from_occluders_does_not_count():
+    hidden = []
+    for scene in scenes(1):
+        (ball,) = scene.bodies
+        before = rigid(translation_m=ball.pose()[:3, 3] / 3)
+        hidden.append(replace(scene, bodies=(ball, replace(ball, name="wall", role="occluder", poses=before))))
+    assert not silent_notes(scenes(1), {"all": (rays_ahead(),)})
+    (note,) = silent_notes(hidden, {"all": (rays_ahead(),)})
+    assert note.startswith("in 6 of 6 frames")

@@ -125,3 +125,6 @@ def test_a_limit_is_told_with_its_unit():
         check_limit(evaluation_of([], names=("f3",)), 4.5)
     assert refused.value.allowed == "at most 4.5 mm"
     check_limit(evaluation_of([], names=("f3",)), 5.0)
+    check_limit(evaluation_of([], "higher", names=("f3",)), 4.5)
+    with pytest.raises(ThresholdError, match="f3 at 196 rays"):
+        check_limit(evaluation_of([], "higher", names=("f3",)), 5.5)

@@ -30,8 +30,8 @@ from lidardesign.task import random_generator, scenes_of
 
 SMALL = (
     "learning.batch=128", "learning.layers=1", "learning.hidden=16", "learning.bins=8", "learning.samples=2000",
-    "learning.balance_proposals=1024", "learning.coverage_proposals=512", "learning.pathwise=16", "train=4", "test=3",
-    "density.sigma_m=0.06", "learning.steps=64", "learning.misplaced=0",
+    "learning.balance_proposals=1024", "learning.coverage_proposals=512", "learning.pathwise=16", "train=6", "test=3",
+    "density.sigma_m=0.06",
 )  # fmt: skip
 
 
@@ -40,7 +40,9 @@ def runs(tmp_path_factory):
     """A run that was learned, and has a design."""
     folder = tmp_path_factory.mktemp("runs") / "mine"
     task = load_task("flatland")
-    config = resolve(task, preset="draft", overrides=SMALL, seed=shifted(1))
+    config = resolve(
+        task, preset="draft", overrides=[*SMALL, "learning.steps=64", "learning.misplaced=0"], seed=shifted(1)
+    )
     folder.mkdir()
     start_manifest(folder, command=[], seed=1)
     save_run_config(config, folder)
@@ -159,7 +161,6 @@ def test_a_tolerance_that_is_missed_exits_1_with_what_was_reached_and_a_usable_r
     assert done.code == 1
     assert done.json["steps"] == 8
     assert "--tolerance" in done.err
-    assert lidardesign("fit", "run", "--layout", "even", "--sensors", "2").code == 0
     again = lidardesign("learn", "flatland", "--out", "run", "--resume", "--tolerance", "0.3")
     assert again.code == 2
     assert "learning.misplaced = 0.0001, not 0.3" in again.err
@@ -185,7 +186,7 @@ def test_a_failure_before_the_first_checkpoint_leaves_nothing_behind(lidardesign
 
 
 def test_a_time_budget_ends_at_the_clock_and_writes_its_steps_into_the_configuration(lidardesign, tmp_path):
-    done = flatland(lidardesign, "run", "--time-budget", "0.3", "--json")
+    done = flatland(lidardesign, "run", "--time-budget", "1", "--json")
     assert done.code == 0
     learning = load_run_config(tmp_path / "run")[1].learning
     assert (learning.misplaced, learning.steps) == (0.0, done.json["steps"])
@@ -203,7 +204,7 @@ def test_a_run_that_ends_by_the_clock_is_resumed_by_one_and_says_so(lidardesign,
     assert stopped.code == 130
     assert "--resume --time-budget 60" in stopped.err
     assert lidardesign("learn", "--out", "run", "--resume").code == 2
-    assert lidardesign("learn", "--out", "run", "--resume", "--time-budget", "0.3").code == 0
+    assert lidardesign("learn", "--out", "run", "--resume", "--time-budget", "1").code == 0
 
 
 def test_what_was_scored_is_written_before_accuracy_is_measured(fitted, lidardesign, monkeypatch):

@@ -160,4 +160,4 @@ def test_workers_end_with_the_program_however_it_ends(run, number):
     assert wait_until(lambda: not any(runs(pid) for pid in workers))
     if number == signal.SIGINT:
         assert ended.returncode == 130
-        assert err.strip() == "interrupted"
+        assert err.splitlines()[-1] == "interrupted"

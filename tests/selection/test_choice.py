@@ -65,19 +65,15 @@ class TestAChoice:
     def test_gains_are_the_differences_of_worth_and_shrink_as_others_are_taken(self, table, seed):
         coverage = small(seed, table=table)
         rays, gates = coverage.shape
-        few = np.full(rays, -1)
-        few[0] = 0
-        more = few.copy()
-        more[1] = 1
-        gains = {}
-        for name, gate in (("few", few), ("more", more)):
-            gains[name] = coverage.gains(coverage.known(gate))
+        few, more = np.full((2, rays), -1)
+        few[0], more[:2] = 0, (0, 1)
+        fewer, further = (coverage.gains(coverage.known(gate)) for gate in (few, more))
+        for gate, gains in ((few, fewer), (more, further)):
             for ray, choice in itertools.product(range(2, rays), range(gates)):
-                added = gate.copy()
-                added[ray] = choice
+                added = np.where(np.arange(rays) == ray, choice, gate)
                 gain = coverage.value_of(added) - coverage.value_of(gate)
-                assert gains[name][ray, choice] == pytest.approx(gain, abs=1e-12)
-        assert (gains["more"][2:] <= gains["few"][2:] + 1e-12).all()
+                assert gains[ray, choice] == pytest.approx(gain, abs=1e-12)
+        assert (further[2:] <= fewer[2:] + 1e-12).all()
 
     @given(
         seed=seeds, price=st.sampled_from([0.0, 0.05, 0.3]), most=st.integers(1, 3),

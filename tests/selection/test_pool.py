@@ -82,7 +82,7 @@ def test_a_run_whose_density_has_a_condition_has_a_pool_of_rays_at_each_of_its_v
 
 
 def test_where_origins_are_free_the_candidates_of_the_last_fit_are_kept(tmp_path):
-    free = make_run(tmp_path / "free", count=2000)
+    free = make_run(tmp_path / "free", count=1000)
     bare = shutil.copytree(free, tmp_path / "bare")
     budget = {"budget": {"bandwidth_mbps": 0.4}}
     open_run(free).fit(sensors=1, rays=16)
@@ -108,8 +108,7 @@ def configured(folder, setting):
 def test_what_the_pool_follows_from_is_noticed_where_it_changes(change, tmp_path, monkeypatch):
     run = make_mesh_run(tmp_path / "run", count=1500)
     before, _ = found(run)
-    meshes, options = tmp_path / "balls", {}
-    same = {"config": RunFolder.open(run).config}
+    meshes, options, own = tmp_path / "balls", {}, RunFolder.open(run).config
     if change == "setting of the task":
         options = configured(run, "task.jitter_rotation_deg=20")
     elif change == "setting of the density":
@@ -135,7 +134,7 @@ def test_what_the_pool_follows_from_is_noticed_where_it_changes(change, tmp_path
     again, none = found(run, **options)
     assert (none, bits(again)) == ([], bits(after))
     if options:
-        back, steps = found(run, **same)
+        back, steps = found(run, config=own)
         assert bits(back) == bits(before)
         assert steps
 

@@ -113,6 +113,7 @@ class TestTheGateThatRaysShare:
             other = shared.copy()
             other[index] = gate
             assert worth(coverage, choice, other)[0] <= best + 1e-6
+        assert price > 0 or (shared == 0).all()
 
     @given(seed=seeds, share=st.floats(0, 1.2))
     def test_is_narrower_only_where_rays_cost_too_much(self, seed, share, price):
@@ -125,8 +126,3 @@ class TestTheGateThatRaysShare:
         assert worth(coverage, choice, shared)[1] <= max(limit, narrowest) * (1 + 1e-8)
         if share > 1 + 1e-9:
             np.testing.assert_array_equal(shared, free)
-
-    def test_of_no_price_and_no_limit_is_open(self, price):
-        coverage, choice = chosen(0, price)
-        shared = _shared_gates(coverage, choice, SENSOR, np.inf)
-        assert (shared == 0).all() == (price == 0)
