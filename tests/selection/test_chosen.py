@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from lidardesign_tasks.flatland import FlatlandTask
+from lidardesign_tasks.meshes import MeshesTask
 from support.command_line import make_run
 from support.conditioned_runs import make_conditioned_run
 from support.mesh_runs import make_mesh_run
@@ -22,7 +26,9 @@ FIELD_RAD = 2e-7  # by which fields may be wider than their rays: digits of angl
 
 @pytest.fixture(autouse=True)
 def few_scenes(monkeypatch):
-    """Rays are chosen on three scenes."""
+    """Rays are chosen on three scenes, for two numbers where none is asked for."""
+    for task in (FlatlandTask, MeshesTask):
+        monkeypatch.setattr(task, "defaults", replace(task.defaults, rays=(8, 24)))
     for module in ("rays.information", "rays.training", "rays.selection", "fitting.chosen", "fitting.trials"):
         monkeypatch.setattr(f"lidardesign.{module}.FEW_SCENES", 3)
 
