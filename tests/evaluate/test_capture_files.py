@@ -69,18 +69,12 @@ def stored(folder, kind, arrays):
 
 
 @pytest.mark.parametrize("kind", FORMATS)
-def test_directions_and_scan_angles_say_the_same(tmp_path, kind):
-    by_angles = stored(tmp_path, kind, make_capture(5)).direction
-    by_vectors = {**without_angles(make_capture(5)), "direction": by_angles.reshape(5, 5, 3)}
-    np.testing.assert_allclose(stored(tmp_path, kind, by_vectors).direction, by_angles, atol=1e-15)
-
-
-@pytest.mark.parametrize("kind", FORMATS)
-def test_every_pixel_may_have_a_start_of_its_own(tmp_path, kind):
-    starts = 2000.0 + np.arange(25.0).reshape(5, 5)
-    np.testing.assert_array_equal(
-        stored(tmp_path, kind, {**make_capture(5), "start_ps": starts}).start_ps, starts.ravel()
-    )
+def test_directions_and_scan_angles_say_the_same_and_every_pixel_may_have_a_start_of_its_own(tmp_path, kind):
+    by_angles, starts = stored(tmp_path, "npz", make_capture(5)).direction, 2000.0 + np.arange(25.0).reshape(5, 5)
+    by_vectors = {**without_angles(make_capture(5)), "direction": by_angles.reshape(5, 5, 3), "start_ps": starts}
+    found = stored(tmp_path, kind, by_vectors)
+    np.testing.assert_allclose(found.direction, by_angles, atol=1e-15)
+    np.testing.assert_array_equal(found.start_ps, starts.ravel())
 
 
 def changed(**values):
@@ -140,7 +134,7 @@ WRONG = {
 
 
 # MATLAB files are read in a process of their own, whose start takes longest: a few of all stand for the rest.
-BY_MATLAB = ("NaN counts", "complex counts", "no bin width", "flat origin")
+BY_MATLAB = ("complex counts", "flat origin")
 
 
 @pytest.mark.parametrize(
@@ -222,7 +216,7 @@ def test_matlab_7_structures_and_foreign_hdf5_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("kind", FORMATS)
-@pytest.mark.parametrize("share", [0.0, 0.3, 0.999])
+@pytest.mark.parametrize("share", [0.3, 0.999])
 def test_a_file_that_was_cut_short_is_refused(tmp_path, kind, share):
     path = path_of(tmp_path, kind)
     FORMATS[kind](path, make_capture(5))

@@ -44,9 +44,9 @@ def laid_out(name, subject, count):
 def test_any_number_is_met_exactly_inside_the_space_where_scenes_return_and_repeats(subject, name):
     space, scenes = SUBJECTS[subject]
     casters = [SceneCaster(scene) for scene in scenes]
+    layouts = [MAKE[name](TrainingViews(space, scenes))[0] for _ in range(2)]
     for count in (0, 1, 70):
-        points, gates = laid_out(name, subject, count)
-        again, gates_again = laid_out(name, subject, count)
+        (points, gates), (again, gates_again) = (one.lay_out(count, LayoutSite(space)) for one in layouts)
         np.testing.assert_array_equal(points, again)
         np.testing.assert_array_equal(gates, gates_again)
         assert points.shape == (count, 5)

@@ -147,7 +147,7 @@ class TestAChoice:
     def test_fires_a_ray_of_each_sensor_where_it_has_to_and_is_near_the_best_of_those(self, table, most, price):
         owner, losses = np.array([0, 0, 1, 1, 1, 2, 2]), []
         counts = RayCounts(np.zeros(7, dtype=int), np.array([most]), owner)
-        for seed in range(20):
+        for seed in range(8):
             coverage = small(seed, table=table)
             choice = choose(coverage, counts, price=price)
             assert len(choice.rays) == most
