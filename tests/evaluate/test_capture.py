@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from support.captures import BALL_AT, BALL_M, BIN_PS, C_M_PER_PS, START_PS, ball_range_m, make_capture
 from support.command_line import caller
+from support.rays import rays_along
 from support.sensors import normal_sensor
 
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.formats.galvo import degree_frame, read_galvo, scan_directions, write_galvo
-from lidardesign.scenes.rays import Rays
+from lidardesign.formats.galvo import degree_frame, scan_directions, write_galvo
 from lidardesign.scoring.captures.capture import Capture, load_capture
 from lidardesign.scoring.captures.scan import (
     Captured,
@@ -31,6 +31,7 @@ from lidardesign.simulate.detector import physics
 
 BIN_M = BIN_PS * C_M_PER_PS / 2
 ESTIMATIONS = [Estimation("peak"), Estimation("matched")]
+EACH_ESTIMATOR = pytest.mark.parametrize("estimation", ESTIMATIONS, ids=lambda one: one.estimator)
 
 
 @pytest.fixture(scope="module")
@@ -57,13 +58,9 @@ def ball_design(rays=150):
     return DesignSpec("ball", (ahead,), constraints={"budget": {"rays": rays}})
 
 
-def rays_along(directions, gate=(0.3, 2.0), origin=(0.0, 0.0, 0.0)):
-    count = len(directions)
-    return Rays(np.tile(origin, (count, 1)), directions, np.tile(gate, (count, 1)), np.zeros(count), np.zeros(count))
-
-
-def looking(scan_deg, **places):
-    return rays_along(scan_directions(degree_frame(0.0, 0.0), np.array(scan_deg, dtype=float)), **places)
+def looking(scan_deg, gate_m=(0.3, 2.0), **places):
+    directions = scan_directions(degree_frame(0.0, 0.0), np.array(scan_deg, dtype=float))
+    return rays_along(directions, gate_m, **places)
 
 
 def random_looks(generator, count):
@@ -80,7 +77,7 @@ def settings(capture, **changes):
 
 def test_a_ray_takes_the_pixel_that_looks_its_way(clean):
     order = np.random.default_rng(0).permutation(len(clean))
-    found = scan(clean, rays_along(clean.direction[order]), 1e-6, Estimation())
+    found = scan(clean, rays_along(clean.direction[order], (0.3, 2.0)), 1e-6, Estimation())
     np.testing.assert_array_equal(found.pixel, order)
     assert found.away_rad.max() < 1e-7
 
@@ -99,7 +96,7 @@ def test_a_gate_hears_the_bins_whose_middles_lie_in_it(clean, gate):
     np.testing.assert_array_equal(np.arange(first[0], last[0]), inside)
 
 
-@pytest.mark.parametrize("estimation", ESTIMATIONS, ids=lambda one: one.estimator)
+@EACH_ESTIMATOR
 def test_what_lies_outside_a_gate_changes_nothing(noisy, estimation):
     rays = ball_design().rays()
     within = default_within_rad(noisy)
@@ -117,7 +114,7 @@ def test_what_lies_outside_a_gate_changes_nothing(noisy, estimation):
     assert ((ranges >= start - BIN_M) & (ranges <= end + BIN_M)).all()
 
 
-@pytest.mark.parametrize("estimation", ESTIMATIONS, ids=lambda one: one.estimator)
+@EACH_ESTIMATOR
 def test_clean_histograms_give_the_true_range_to_a_bin(clean, estimation):
     found = scan_pixels(clean, estimation)
     assert found.returned.all()
@@ -127,7 +124,7 @@ def test_clean_histograms_give_the_true_range_to_a_bin(clean, estimation):
     np.testing.assert_allclose(found.points_m, found.range_m[:, None] * clean.direction, atol=1e-15)
 
 
-@pytest.mark.parametrize("estimation", ESTIMATIONS, ids=lambda one: one.estimator)
+@EACH_ESTIMATOR
 def test_ranges_do_not_depend_on_how_many_are_worked_on_at_once(noisy, estimation, monkeypatch):
     rays = ball_design().rays()
     found = scan(noisy, rays, 0.1, estimation)
@@ -138,7 +135,7 @@ def test_ranges_do_not_depend_on_how_many_are_worked_on_at_once(noisy, estimatio
     np.testing.assert_array_equal(scan(noisy, rays.subset(some), 0.1, estimation).range_m, found.range_m[some])
 
 
-@pytest.mark.parametrize("estimation", ESTIMATIONS, ids=lambda one: one.estimator)
+@EACH_ESTIMATOR
 def test_pixels_may_begin_to_count_at_different_times(clean, estimation):
     cut = np.random.default_rng(4).integers(0, 40, len(clean))
     at = np.minimum(cut[:, None] + np.arange(560), 599)
@@ -146,26 +143,10 @@ def test_pixels_may_begin_to_count_at_different_times(clean, estimation):
         clean, counts=np.take_along_axis(clean.counts, at, axis=1), start_ps=clean.start_ps + cut * clean.bin_ps
     )
     later.__dict__["background_per_bin"] = clean.background_per_bin
-    rays = looking([[0, 0], [3, 4], [-10, 8], [7, -7]], gate=(0.42, 0.9))
+    rays = looking([[0, 0], [3, 4], [-10, 8], [7, -7]], gate_m=(0.42, 0.9))
     found, again = (scan(one, rays, 0.02, estimation) for one in (clean, later))
     np.testing.assert_allclose(again.range_m, found.range_m, atol=1e-12)
     np.testing.assert_array_equal(again.photons, found.photons)
-
-
-def test_the_usual_background_is_what_was_put_in(clean, noisy):
-    # 961 pixels of 37 bins in the middle stretch: 0.05 +- 0.0012 each, a median of medians less
-    assert clean.background_per_bin == pytest.approx(0.05, rel=0.15)
-    assert noisy.background_per_bin == pytest.approx(0.05, rel=0.15)
-
-
-def test_background_alone_is_seldom_taken_for_a_return():
-    generator = np.random.default_rng(8)
-    looks = random_looks(generator, 3000)
-    dark = Capture(generator.poisson(0.5, (3000, 200)), BIN_PS, START_PS, np.zeros(3), looks, pulse_fwhm_ps=60.0)
-    for estimation in ESTIMATIONS:
-        share = scan_pixels(dark, estimation).returned.mean()
-        # 1 % are allowed; the level is estimated from the same 100 photons, which costs as much again
-        assert share < 0.03
 
 
 @pytest.mark.parametrize("per_bin", [0.003, 0.01, 0.03])
@@ -203,7 +184,7 @@ def test_rays_that_were_not_captured_return_nothing_and_say_why(clean):
     [
         (looking([[0, 0]], origin=(0.4, 0.0, 0.0)), r"start 0.4 m from \[0.0, 0.0, 0.0\]"),
         (looking([[30, 0]]), "point 15 degrees past"),
-        (looking([[0, 0]], gate=(5.0, 6.0)), "no bin between 0.2998 and 2.099 m"),
+        (looking([[0, 0]], gate_m=(5.0, 6.0)), "no bin between 0.2998 and 2.099 m"),
     ],
 )
 def test_a_design_of_which_nothing_was_captured_is_refused(clean, rays, message):
@@ -216,12 +197,9 @@ def test_a_single_pixel_needs_an_angle(clean):
     with pytest.raises(ConfigError, match="--within-deg"):
         default_within_rad(one)
     assert uniform_rays(one, 4).direction == pytest.approx(np.repeat(clean.direction[:1], 4, axis=0))
-
-
-def test_pixels_that_were_captured_twice_are_as_far_apart_as_before(clean):
-    twice = Capture(
-        np.repeat(clean.counts, 2, axis=0), BIN_PS, START_PS, np.zeros(3), np.repeat(clean.direction, 2, axis=0)
-    )
+    # pixels that were captured twice are as far apart as before
+    counts, looks = (np.repeat(one, 2, axis=0) for one in (clean.counts, clean.direction))
+    twice = Capture(counts, BIN_PS, START_PS, np.zeros(3), looks)
     assert twice.spacing_rad == pytest.approx(clean.spacing_rad, rel=1e-6)
 
 
@@ -238,12 +216,10 @@ def test_uniform_rays_of_a_square_capture_are_its_pixels(clean):
     assert sorted(found.pixel) == list(range(31 * 31))
 
 
-@pytest.mark.parametrize("count", [1, 7, 100, 576])
+@pytest.mark.parametrize("count", [1, 7, 576])
 def test_uniform_rays_are_as_many_as_asked_for_and_all_captured(clean, count):
-    rays = uniform_rays(clean, count)
-    assert len(rays) == count
-    found = scan(clean, rays, default_within_rad(clean), Estimation())
-    assert (found.captured == Captured.YES).all()
+    found = scan(clean, uniform_rays(clean, count), default_within_rad(clean), Estimation())
+    assert found.captured.tolist() == [Captured.YES] * count
 
 
 def test_a_gated_capture_knows_nothing_of_rays_without_gates(clean):
@@ -257,11 +233,10 @@ def test_gates_remove_the_false_peaks_that_lie_outside_them(noisy):
     rays = ball_design().rays()
     own, whole, uniform = evaluate_capture(noisy, [("ball", rays)], settings(noisy)).rows
     assert (own.gate, whole.gate, uniform.gate, uniform.baseline) == ("own", "whole", "whole", True)
-    figures = [row.as_dict() for row in (own, whole, uniform)]
-    assert figures[0]["outliers"] == 0
-    assert 5 < figures[1]["outliers_percent"] < 15
-    assert 5 < figures[2]["outliers_percent"] < 15
-    assert figures[0]["bins_per_ray"] < 0.1 * figures[1]["bins_per_ray"]
+    gated, *others = (row.as_dict() for row in (own, whole, uniform))
+    assert gated["outliers"] == 0
+    assert all(5 < figures["outliers_percent"] < 15 for figures in others)
+    assert gated["bins_per_ray"] < 0.1 * others[0]["bins_per_ray"]
     # where both are right, the gate changes nothing
     both = own.scan.returned & ~own.outlier & ~whole.outlier
     np.testing.assert_array_equal(own.scan.range_m[both], whole.scan.range_m[both])
@@ -290,7 +265,7 @@ def test_what_is_counted_before_the_pulse_left_is_no_range_of_a_pixel():
     whole = whole_window(looking([[0, 0]]), early)
     for found in (scan_pixels(early, Estimation()), scan(early, whole, 1.0, Estimation())):
         assert found.range_m == pytest.approx(170.5 * BIN_M)
-    judged = evaluate_capture(early, [("one", looking([[0, 0]], gate=(0.1, 2.0)))], settings(early, within_rad=0.1))
+    judged = evaluate_capture(early, [("one", looking([[0, 0]], gate_m=(0.1, 2.0)))], settings(early, within_rad=0.1))
     assert not any(row.outlier.any() for row in judged.rows)
 
 
@@ -337,18 +312,6 @@ def test_fields_across_azimuth_zero_and_behind_are_one_field(tmp_path):
         np.testing.assert_allclose(ball_range_m(capture.direction @ degree_frame(azimuth, 0.0).T), capture.true_range_m)
 
 
-def test_a_capture_of_the_exported_rays_alone_is_enough(tmp_path):
-    write_galvo(ball_design(), ball_design().rays(), tmp_path / "ball.galvo.csv")
-    rays = read_galvo(tmp_path / "ball.galvo.csv")
-    counts = np.zeros((len(rays), 600), np.uint8)
-    known = ball_range_m(rays.direction)
-    counts[np.arange(len(rays)), ((2 * known / C_M_PER_PS - START_PS) / BIN_PS).astype(int)] = 9
-    capture = Capture(counts, BIN_PS, START_PS, np.zeros(3), rays.direction, known)
-    found = scan(capture, whole_window(rays, capture), 1e-9, Estimation())
-    np.testing.assert_array_equal(found.pixel, np.arange(len(rays)))
-    np.testing.assert_allclose(found.range_m, known, atol=BIN_M / 2 + 1e-12)
-
-
 # --- the program
 
 
@@ -372,37 +335,27 @@ def test_the_program_scores_designs_and_their_exports_side_by_side(call, tmp_pat
     assert [(row["design"], row["gate"]) for row in document["rows"]] == [
         ("ball", "own"), ("ball", "whole"), ("mirrors", "own"), ("mirrors", "whole"), ("uniform", "whole"),
     ]  # fmt: skip
-    for row in document["rows"]:
-        assert row["rays"] == row["captured"] == 150
+    assert all(row["rays"] == row["captured"] == 150 for row in document["rows"])
     with open(tmp_path / "points.csv", encoding="utf-8") as file:
         lines = list(csv.DictReader(file))
     assert len(lines) == 5 * 150
     point = next(line for line in lines if line["range_m"])
     place = np.array([float(point[f"point_{axis}_m"]) for axis in "xyz"])
     assert np.linalg.norm(place) == pytest.approx(float(point["range_m"]))
-
-
-def test_the_table_names_its_judges(call):
-    done = call("capture", "untrue.npz", "ball.yaml", "--outlier-mm", "5")
-    assert done.code == 0
-    assert "5 mm from the median range of the 9 nearest pixels" in done.out
-    assert "uniform" in done.out
+    # the table names its judges
+    assert "5 mm from the median range" in call("capture", "untrue.npz", "ball.yaml", "--outlier-mm", "5").out
 
 
 BAD = [
-    ("capture clean.npz absent.yaml", 3, "absent.yaml"),
     ("capture ball.yaml ball.yaml", 3, "suffix '.yaml'"),
     ("capture clean.npz ball.yaml --estimator mean", 2, "peak, matched"),
     ("capture clean.npz ball.yaml --within-deg 0", 2, "--within-deg"),
-    ("capture clean.npz ball.yaml --within-deg nan", 2, "--within-deg"),
     ("capture clean.npz ball.yaml --outlier-mm -1", 2, "--outlier-mm"),
     ("capture clean.npz ball.yaml --false-alarm 1", 2, "--false-alarm"),
     ("capture clean.npz ball.yaml ball.yaml", 2, "given twice"),
     ("capture clean.npz ball.yaml --reference absent.ply", 3, "absent.ply"),
     ("capture clean.npz ball.yaml --at x_m=1", 3, "start 1 m from"),
-    ("capture clean.npz ball.yaml --at x_m=wide", 2, "--at"),
     ("capture noisy.npz ball.galvo.csv --rays 7", 2, "holds its rays already"),
-    ("capture clean.npz", 2, "DESIGN"),
 ]
 
 

@@ -27,7 +27,7 @@ with warnings.catch_warnings():
 
 pytestmark = [
     # what dask.distributed leaves to be collected at the end of a test is not ours to close
-    pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning:(distributed|tornado|dask).*"),
+    pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning:(distributed|tornado|dask).*")
 ]
 PATIENCE_S = 60.0
 
@@ -109,10 +109,20 @@ def test_a_scheduler_that_is_lost_ends_the_evaluation_with_its_address(scheduler
         evaluate(replace(request, starmap=starmap), progress=after_one_scene(scheduler.scheduler.kill))
 
 
-def test_a_scheduler_without_workers_is_refused(scheduler, monkeypatch):
-    monkeypatch.setattr(workers, "WORKER_SECONDS", 0.5)
-    with pytest.raises(ConfigError, match=f"the scheduler at {scheduler.address} had no worker"):
-        score_by(scheduler.address)
+def test_a_scheduler_without_workers_and_workers_of_other_packages_are_refused(scheduler, tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(workers, "WORKER_SECONDS", 0.5)
+        with pytest.raises(ConfigError, match=f"{scheduler.address} had no worker"):
+            score_by(scheduler.address)
+    scheduler.add_worker()
+    with monkeypatch.context() as patch:
+        patch.setattr(workers, "__version__", "9.9")
+        with pytest.raises(ConfigError, match=r"the cluster has lidardesign [^9].*\n  allowed: lidardesign 9\.9"):
+            score_by(scheduler.address)
+    install_plugins(tmp_path / "site", {"ball": GOOD})
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    with pytest.raises(ConfigError, match="plugins_ball"), opened_workers(scheduler.address, load_task("ball"), 6):
+        pass
 
 
 def test_an_address_where_nothing_answers_is_refused(monkeypatch):
@@ -138,31 +148,16 @@ def test_without_dask_the_message_says_what_to_install(monkeypatch):
         score_by("tcp://127.0.0.1:1")
 
 
-def test_a_cluster_of_another_version_is_refused(scheduler, monkeypatch):
-    scheduler.add_worker()
-    monkeypatch.setattr(workers, "__version__", "9.9")
-    with pytest.raises(ConfigError, match=r"the cluster has lidardesign [^9].*\n  allowed: lidardesign 9\.9"):
-        score_by(scheduler.address)
-
-
-def test_a_plugin_that_workers_lack_is_named(scheduler, tmp_path, monkeypatch):
-    install_plugins(tmp_path / "site", {"ball": GOOD})
-    monkeypatch.syspath_prepend(tmp_path / "site")
-    scheduler.add_worker()
-    with pytest.raises(ConfigError, match="plugins_ball"), opened_workers(scheduler.address, load_task("ball"), 6):
-        pass
-
-
 def test_a_cluster_that_lost_its_last_worker_is_given_up(scheduler, monkeypatch):
     request = make_request()
     only = scheduler.add_worker()
 
     def kill():
-        monkeypatch.setattr(workers, "WORKER_SECONDS", 1.0)
+        monkeypatch.setattr(workers, "WORKER_SECONDS", 0.3)
         only.kill()
 
     with (
-        pytest.raises(ConfigError, match="no worker within 1 s"),
+        pytest.raises(ConfigError, match="no worker within"),
         opened_workers(scheduler.address, request.task, 6) as starmap,
     ):
         evaluate(replace(request, starmap=starmap), progress=after_one_scene(kill))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from types import SimpleNamespace
 
@@ -14,52 +13,36 @@ from scipy.stats import norm
 from support.meshes import icosphere
 from support.references import shape_distance
 
-from lidardesign.config import DensitySettings, LearningSettings, resolve, save_run_config
+from lidardesign.config import DensitySettings, LearningSettings
 from lidardesign.density.coordinates import Coordinates
 from lidardesign.density.fields.distance import build_field
 from lidardesign.density.network import DesignFlow
 from lidardesign.density.objective.target import build_target
-from lidardesign.density.training.learn import learn
-from lidardesign.density.training.learned import (
-    LearningSteps,
-    gradient,
-    in_arithmetic,
-    noise_share,
-    noise_shares,
-)
+from lidardesign.density.training.learned import LearningSteps, gradient, in_arithmetic, noise_share, noise_shares
 from lidardesign.density.training.losses import Pool
 from lidardesign.density.training.quality import misplaced_share
 from lidardesign.errors import NumericalError
-from lidardesign.registry import load_task
-from lidardesign.run.manifest import start_manifest
 from lidardesign.scenes.scene import Body, Box, Mesh, Receiver, Scene, Sphere, rigid
 from lidardesign.scoring.accuracy import fields
 from lidardesign.scoring.accuracy import training as learning_steps
 from lidardesign.scoring.accuracy.fields import LOG_OPAQUE, exact_distances, fresh_table, opaque_target
-from lidardesign.scoring.accuracy.probes import AccuracyRequest, draw_probes, few_columns, with_frames
-from lidardesign.scoring.evaluation.request import EvaluationRequest
+from lidardesign.scoring.accuracy.probes import draw_probes, few_columns, with_frames
 from lidardesign.space import DesignSpace
-from lidardesign.task import scenes_of
 
 SPACE = DesignSpace((0, 0, 0, -0.35, -0.35, 0.5), (0, 0, 0, 0.35, 0.35, 3.5))
 SETTINGS = DensitySettings(sigma_m=0.02)
-
-
+BALL = icosphere(0.3, subdivisions=3)
 pytestmark = pytest.mark.usefixtures("own_cache")
 
 
-def box_mesh(*half):
+def box_mesh(half):
     made = trimesh.creation.box(extents=2 * np.array(half))
     return Mesh(made.vertices, made.faces)
 
 
-def ball_mesh():
-    return icosphere(0.3, subdivisions=3)
-
-
 def hidden_wall(place, kind=Box):
     """A wall behind a plate of 5 mm that hides a part of it."""
-    make = Box if kind is Box else lambda half: box_mesh(*half)
+    make = Box if kind is Box else box_mesh
     wall = Body(make((0.05, 1.5, 1.5)), "wall", "both", rigid(translation_m=(3.05, 0, 0)))
     plate = Body(make((0.0025, 0.25, 0.25)), "plate", "occluder", rigid(translation_m=place))
     return Scene((wall, plate))
@@ -67,7 +50,7 @@ def hidden_wall(place, kind=Box):
 
 def balls(count, seed=0):
     places = np.random.default_rng(seed).uniform((1.9, -0.2, -0.2), (2.1, 0.2, 0.2), (count, 3))
-    return [Scene((Body(ball_mesh(), "ball", "both", rigid(translation_m=place)),)) for place in places]
+    return [Scene((Body(BALL, "ball", "both", rigid(translation_m=place)),)) for place in places]
 
 
 def moving_ball(frames):
@@ -91,14 +74,9 @@ class TestMisplacedShare:
         # the relative error of a standard deviation from 200 values is 5 %
         assert found[:, 0].std() == pytest.approx(found[:, 1].mean(), rel=0.2)
 
-    def test_the_same_density_at_any_scale_is_nowhere_apart(self):
-        log_first, _, log_proposal = self.gaussians(0.5)
-        share, error = misplaced_share(log_first, log_first + 7.0, log_proposal)
-        assert share == pytest.approx(0, abs=1e-12)
-        assert error == pytest.approx(0, abs=1e-12)
-
-    def test_is_symmetric_and_at_most_one(self):
+    def test_is_symmetric_at_most_one_and_nothing_at_any_other_scale(self):
         first, second, proposal = self.gaussians(0.5)
+        assert misplaced_share(first, first + 7.0, proposal) == pytest.approx((0, 0), abs=1e-12)
         assert misplaced_share(first, second, proposal) == pytest.approx(misplaced_share(second, first, proposal))
         left, right = np.array([0.0, -np.inf]), np.array([-np.inf, 0.0])
         assert misplaced_share(left, right, np.zeros(2))[0] == 1.0
@@ -109,12 +87,10 @@ class TestMisplacedShare:
         once = misplaced_share(first, second, proposal - math.log(2))
         assert twice[0] == pytest.approx(once[0])
 
-    @pytest.mark.parametrize("bad", [np.nan, np.inf])
+    @pytest.mark.parametrize("bad", [[0.0, np.nan], [0.0, np.inf], [-np.inf, -np.inf]])
     def test_what_is_no_density_is_refused(self, bad):
         with pytest.raises(NumericalError, match="no finite mass"):
-            misplaced_share(np.array([0.0, bad]), np.zeros(2), np.zeros(2))
-        with pytest.raises(NumericalError, match="no finite mass"):
-            misplaced_share(np.full(2, -np.inf), np.zeros(2), np.zeros(2))
+            misplaced_share(np.array(bad), np.zeros(2), np.zeros(2))
 
 
 class TestProbes:
@@ -170,14 +146,11 @@ class TestVisibilitySweep:
     @staticmethod
     def cases():
         places = [(1.2, 0.1, 0.0), (1.8, -0.1, 0.1)]
-        made = {}
+        few = {kind: [hidden_wall(place, kind) for place in places] for kind in (Box, Mesh)}
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(fields, "VISIBILITY_PROBES", 4096)
             patch.setattr(fields, "TABLE_PROBES", 1024)
-            for kind in (Box, Mesh):
-                few = [hidden_wall(place, kind) for place in places]
-                made[kind] = fields.VisibilityCase.of(few, SPACE, SETTINGS, seed=0, batch=64)
-        return made
+            return {kind: fields.VisibilityCase.of(few[kind], SPACE, SETTINGS, seed=0, batch=64) for kind in few}
 
     @pytest.mark.parametrize("kind", [Box, Mesh])
     def test_ray_casting_is_chosen_where_thin_plates_hide_things(self, cases, kind):
@@ -208,14 +181,14 @@ class TestComparedFields:
     def test_exact_distances_of_a_mesh_are_those_of_its_box(self):
         pose = rigid(trimesh.transformations.rotation_matrix(0.7, (1, 2, 3))[:3, :3], (0.1, 0.2, -0.1))
         half = (0.3, 0.4, 0.5)
-        scene = Scene((Body(box_mesh(*half), poses=pose),))
+        scene = Scene((Body(box_mesh(half), poses=pose),))
         found = exact_distances([scene], self.POINTS)[:, 0]
         local = (self.POINTS - pose[:3, 3]) @ pose[:3, :3]
         assert found == pytest.approx(shape_distance(Box(half))(local), abs=1e-12)
 
     def test_exact_distances_mix_meshes_and_primitives_and_follow_motion(self):
         poses = np.stack([rigid(translation_m=(x, 0, 0)) for x in (-0.5, 0.5)])
-        scene = Scene((Body(box_mesh(0.1, 0.1, 0.1), poses=poses), Body(Sphere(0.2))))
+        scene = Scene((Body(box_mesh((0.1, 0.1, 0.1)), poses=poses), Body(Sphere(0.2))))
         found = exact_distances([scene], self.POINTS)
         for frame, x in enumerate((-0.5, 0.5)):
             box = shape_distance(Box((0.1, 0.1, 0.1)))(self.POINTS - (x, 0, 0))
@@ -266,7 +239,7 @@ class TestFieldSweeps:
         monkeypatch.setattr(fields, "PROBES", 512)
         monkeypatch.setattr(fields, "RESOLUTIONS", (12, 48))
         poses = np.stack([rigid(translation_m=(2.0, y, 0)) for y in (-0.1, 0.0, 0.1)])
-        scene = Scene((Body(ball_mesh(), poses=poses),))
+        scene = Scene((Body(BALL, poses=poses),))
         case = fields.FieldCase.of([scene], SPACE, DensitySettings(sigma_m=0.02, field_resolution=48), 0, "off")
         sweep = fields.resolution_sweep(case)
         assert sweep.measurements[0].error > sweep.measurements[1].error
@@ -275,37 +248,6 @@ class TestFieldSweeps:
     def test_primitives_need_no_field(self):
         request = SimpleNamespace(config=None, request=SimpleNamespace(train=[hidden_wall((1.5, 0, 0))]))
         assert fields.field_sweeps(request) == []
-
-
-class TestDrawnScenes:
-    def test_the_mean_over_all_choices_is_the_density_of_all(self):
-        every = balls(4)
-        target = build_target(every, SPACE, SETTINGS, "raycast")
-        points = draw_probes(target, 200, 0, "test").points
-        # culled by other best terms, scenes that are left out add less than exp(-16) of the largest term
-        means = [
-            np.exp(target.subsample(np.array(chosen)).log_density(points))
-            for chosen in itertools.combinations(range(4), 2)
-        ]
-        assert np.mean(means, axis=0) == pytest.approx(np.exp(target.log_density(points)), rel=1e-5, abs=1e-7)
-
-    def test_scenes_that_were_not_drawn_are_not_looked_at(self):
-        every = balls(3)
-        target = build_target(every, SPACE, SETTINGS, "raycast")
-        seen = []
-        way = target.visibility.transmittance
-
-        def watched(rays, active, *args, **options):
-            seen.append(active)
-            return way(rays, active, *args, **options)
-
-        target.visibility.transmittance = watched
-        points = draw_probes(target, 100, 0, "test").points
-        values, slopes = target.subsample(np.array([1])).log_density_and_gradient(points)
-        assert np.isfinite(values).all()
-        assert np.isfinite(slopes).all()
-        assert not seen[0][:, [0, 2]].any()
-        assert seen[0][:, 1].all()
 
 
 @pytest.fixture(scope="module")
@@ -350,16 +292,13 @@ class TestGradients:
         assert np.linalg.norm(rough - exact) < 1e-2 * np.linalg.norm(exact)
         assert np.array_equal(exact, gradient(steps.flow, loss, 3, 1e9))
 
-    def test_what_is_not_finite_moves_nothing(self, steps):
+    def test_what_is_not_finite_moves_nothing_and_the_flow_alone_takes_no_target(self, steps):
         found = gradient(steps.flow, lambda flow, generator: next(flow.parameters()).sum() * math.nan, 0, 1.0)
         assert not found.any()
-
-    def test_the_flow_alone_takes_no_target(self, steps):
-        loss = steps.without_target().pathwise()
-        assert np.isfinite(gradient(steps.flow, loss, 0, 1.0)).all()
+        assert np.isfinite(gradient(steps.flow, steps.without_target().pathwise(), 0, 1.0)).all()
 
 
-class TestPrecisionSweep:
+class TestSweepsOfSteps:
     def test_rounding_is_far_below_the_noise_of_a_batch(self, steps, monkeypatch):
         monkeypatch.setattr(learning_steps, "DTYPE_BATCHES", 4)
         sweep = learning_steps.dtype_sweep(steps, 0)
@@ -369,8 +308,6 @@ class TestPrecisionSweep:
         assert exact.reference
         assert 0 < rough.error < sweep.tolerance
 
-
-class TestScenesSweep:
     def test_more_scenes_err_less(self, steps, monkeypatch):
         monkeypatch.setattr(learning_steps, "POWERS", (1, 4))
         monkeypatch.setattr(learning_steps, "FRAMES_BATCHES", 8)
@@ -384,47 +321,3 @@ class TestScenesSweep:
     def test_settings_beyond_all_scenes_are_all_scenes(self):
         assert learning_steps.counts(50, 50) == [4, 16, 50]
         assert learning_steps.counts(2000, 256) == [4, 16, 64, 256, 2000]
-
-
-class TestRuns:
-    """The sweeps of a run from its folder, as `evaluate --accuracy` asks for them."""
-
-    SMALL = (
-        "learning.steps=4", "learning.batch=32", "learning.layers=1", "learning.hidden=8", "learning.bins=4",
-        "learning.samples=1000", "learning.balance_proposals=256", "learning.coverage_proposals=256", "train=6",
-    )  # fmt: skip
-
-    @pytest.fixture(scope="class")
-    @staticmethod
-    def request_of(tmp_path_factory):
-        place = tmp_path_factory.mktemp("run") / "flatland"
-        task = load_task("flatland")
-        config = resolve(task, preset="draft", overrides=TestRuns.SMALL, seed=1)
-        place.mkdir()
-        start_manifest(place, command=[], seed=1)
-        save_run_config(config, place)
-        learn(task, config, place)
-        train = list(scenes_of(task, config.task, "train", config.seed, config.space))
-        asked = EvaluationRequest(task, config.task, config.space, config.seed, (), [12], train=train)
-        return AccuracyRequest(config, place, asked, None)
-
-    @pytest.mark.parametrize(
-        ("sweeps", "count"),
-        [
-            (fields.visibility_sweeps, 1),
-            (fields.field_sweeps, 0),
-            (learning_steps.dtype_sweeps, 1),
-            (learning_steps.frames_sweeps, 1),
-        ],
-    )
-    def test_have_sweeps_whose_errors_fall(self, request_of, sweeps, count, monkeypatch):
-        monkeypatch.setattr(fields, "VISIBILITY_PROBES", 2048)
-        monkeypatch.setattr(fields, "BODY_PROBES", 256)
-        monkeypatch.setattr(learning_steps, "DTYPE_BATCHES", 4)
-        monkeypatch.setattr(learning_steps, "FRAMES_BATCHES", 4)
-        found = sweeps(request_of)
-        assert len(found) == count
-        for sweep in found:
-            assert sweep.falls
-            assert all(measurement.seconds > 0 and measurement.uncertainty >= 0 for measurement in sweep.measurements)
-            assert sweep.as_rows()

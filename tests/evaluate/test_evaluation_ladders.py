@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.evaluations import METRIC
 from support.references import STANDARD_ERRORS
 from support.scoring import design, make_request, scenes
 
@@ -15,9 +16,6 @@ from lidardesign.scoring.evaluation.score import evaluate
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.plan import Planner
 from lidardesign.space import DesignSpace
-from lidardesign.task import Metric
-
-METRIC = Metric("Chamfer distance", "mm", "lower", worst=200.0, tolerance=0.1)
 
 
 def make_row(name, values, baseline=False, rays=9):
@@ -117,7 +115,7 @@ def test_the_settings_that_the_evaluation_has_are_marked():
 
 def test_where_the_detector_asks_for_nothing_another_one_stands_in_and_no_setting_is_the_runs():
     for sweep in sweeps.physics_sweeps(of_light("ideal")):
-        assert "measured by single-photon" in sweep.note
+        assert "single-photon" in sweep.note
         assert sweep.default is None
 
 
@@ -138,12 +136,11 @@ def test_gates_beyond_what_the_stand_in_hears_have_no_sweeps():
     assert sweeps.physics_sweeps(AccuracyRequest(None, None, far, None)) == []
 
 
-def test_a_single_scene_says_that_its_uncertainty_is_unknown():
+def test_a_single_scene_says_that_its_uncertainty_is_unknown_and_without_designs_nothing_is_measured():
     asked = of_light("single-photon")
-    alone = replace(asked, request=replace(asked.request, test=asked.request.test[:1]))
-    assert all("in 1 scene, so that differences" in sweep.note for sweep in sweeps.physics_sweeps(alone))
-
-
-def test_without_designs_nothing_is_measured():
-    asked = of_light("single-photon")
-    assert sweeps.physics_sweeps(replace(asked, request=replace(asked.request, designs=[]))) == []
+    alone, empty = (
+        replace(asked, request=replace(asked.request, **changes))
+        for changes in ({"test": asked.request.test[:1]}, {"designs": []})
+    )
+    assert all("in 1 scene" in sweep.note for sweep in sweeps.physics_sweeps(alone))
+    assert sweeps.physics_sweeps(empty) == []

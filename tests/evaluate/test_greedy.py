@@ -27,6 +27,7 @@ from lidardesign.space import DesignSpace, angles
 
 RADIUS_M = 0.4
 EVEN_ON_A_BALL = np.random.default_rng(4).normal(size=(300, 3))
+EVEN_ON_A_BALL /= np.linalg.norm(EVEN_ON_A_BALL, axis=1, keepdims=True)
 AHEAD = DesignSpace((0, 0, 0, -0.5, -0.5, 0.05), (0, 0, 0, 0.5, 0.5, 4.0))
 BOX = DesignSpace((-0.3, -0.1, -0.1, -0.5, -0.5, 0.05), (0.1, 0.1, 0.1, 0.5, 0.5, 4.0))
 LINE = DesignSpace((0, 0, 0, -0.5, 0, 0.05), (0, 0, 0, 0.5, 0, 4.0))
@@ -45,28 +46,21 @@ def scenes(seed, count=12):
 
 def visible(scene):
     """Points of the half of a ball that looks to the sensor, (U, 3) [m]."""
-    outward = EVEN_ON_A_BALL / np.linalg.norm(EVEN_ON_A_BALL, axis=1, keepdims=True)
-    return scene.bodies[0].pose(0)[:3, 3] + RADIUS_M * outward[outward[:, 0] < 0]
+    return scene.bodies[0].pose(0)[:3, 3] + RADIUS_M * EVEN_ON_A_BALL[EVEN_ON_A_BALL[:, 0] < 0]
 
 
 class BallTask(MissTask):
     """Says that returns tell about points of balls that are near them."""
 
     def informs(self, scene, returns):
-        points = visible(scene)
-        return information.surface_information(
-            [points] * len(returns), returns, [True], len(returns) * 2 * np.pi * RADIUS_M**2
-        )
+        area_m2 = len(returns) * 2 * np.pi * RADIUS_M**2
+        return information.surface_information([visible(scene)] * len(returns), returns, [True], area_m2)
 
 
 def training(task=None, seed=5):
     """The training scenes of a run of the task, without end."""
-    density = SimpleNamespace(sigma_m=0.01)
-    run = SimpleNamespace(
-        task=task or BallTask(),
-        config=SimpleNamespace(density=density),
-        scenes=lambda split, seed: scenes(seed),
-    )
+    config = SimpleNamespace(density=SimpleNamespace(sigma_m=0.01))
+    run = SimpleNamespace(task=task or BallTask(), config=config, scenes=lambda split, seed: scenes(seed))
     return TrainingScenes(run, seed)
 
 
@@ -117,7 +111,7 @@ def distance(rays, over):
 def test_returns_are_nearer_to_surfaces_than_those_of_even_and_random_rays_in_no_less_bandwidth(subject):
     space, held_out, count = SUBJECTS[subject], scenes(900, count=20), COUNTS[-1]
     ratios = []
-    for seed in range(4):
+    for seed in range(3):
         baselines = SceneBaselines(space, scenes(seed), seed, gates_per_ray=True)
         (even,), (random,) = (baselines.positions(name, count) for name in ("bounding", "random"))
         (chosen,) = candidate(space, [Fired(count, BANDWIDTH.mbps(even))], seed=seed).positions([space], count)
@@ -171,10 +165,8 @@ def test_bandwidth_is_spent_at_the_places_where_it_tells_most():
 
 
 def test_many_rays_at_many_places_take_too_long():
-    assert greedy_rays(BallTask(), 4, (5, 500, 600)) == (
-        [5, 500],
-        ["greedy is left out above 500 rays: choosing them takes too long"],
-    )
+    counts, (note,) = greedy_rays(BallTask(), 4, (5, 500, 600))
+    assert (counts, "above 500 rays" in note) == ([5, 500], True)
 
 
 def aimed(counts=COUNTS):
@@ -209,18 +201,15 @@ def test_an_evaluation_has_it_at_each_number_of_rays_in_no_more_bandwidth_than_t
 
 @pytest.mark.parametrize(
     ("changes", "note"),
-    [
-        ({"task": MissTask()}, "greedy is left out: the task miss has no method informs"),
-        ({"rays": (5, 40)}, "greedy is left out above 30 rays: choosing them takes too long"),
-        ({"training": None}, None),
-    ],
+    [({"task": MissTask()}, "no method informs"), ({"rays": (5, 40)}, "above 30 rays"), ({"training": None}, None)],
 )
 def test_it_is_left_out_with_one_note_where_rays_cannot_be_chosen(monkeypatch, changes, note):
     monkeypatch.setattr(greedy_module, "MOST_CHOSEN", 30)
     evaluation = evaluate(ball_request(**changes))
     kept = {row.rays for row in [*evaluation.rows, *evaluation.equal_bandwidth] if row.design == "greedy"}
     assert kept == ({5} if "rays" in changes else set())
-    assert [line for line in evaluation.notes if "greedy" in line] == ([note] if note else [])
+    notes = [line for line in evaluation.notes if "greedy" in line]
+    assert [note in line for line in notes] == ([True] if note else [])
 
 
 @pytest.mark.parametrize("number", [7, 12])

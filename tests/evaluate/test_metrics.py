@@ -11,7 +11,6 @@ from support.triangles import naive_triangle_distance_m
 
 from lidardesign.errors import DataError
 from lidardesign.scenes.scene import Body, Box, Mesh, Scene, Sphere, rigid
-from lidardesign.scenes.surface import sample_triangles
 from lidardesign.scoring.metrics import (
     chamfer_m,
     delaunay_surface,
@@ -23,10 +22,7 @@ from lidardesign.scoring.metrics import (
 from lidardesign.space import DesignSpace, angles
 
 STANDARD_ERRORS = 4  # the tolerance of every sampled mean below
-
-
-def visible_surface_points(*arguments, **options):
-    return visible_surface(*arguments, **options).points
+SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]])
 
 
 def generator(seed=0):
@@ -76,23 +72,14 @@ def test_a_visible_surface_has_each_triangle_with_a_visible_point_once():
 
 
 def test_two_samplings_of_one_surface_have_no_distance():
-    vertices, faces = (
-        np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]),
-        np.array([[0, 1, 2], [0, 2, 3]]),
-    )
-    first, second = (surface_cloud(vertices, faces, 300, generator(seed)) for seed in (1, 2))
+    first, second = (surface_cloud(*SQUARE, 300, generator(seed)) for seed in (1, 2))
     np.testing.assert_allclose(first.distance_m(second.points), 0.0, atol=1e-12)
     np.testing.assert_allclose(first.distance_m(second.points + np.array([0, 0, 0.1])), 0.1, atol=1e-12)
 
 
-def directions_around_x(count, spread=0.5):
-    offset = np.column_stack([np.ones(count), spread * generator(4).uniform(-1, 1, (count, 2))])
-    return offset / np.linalg.norm(offset, axis=1, keepdims=True)
-
-
 def test_one_place_in_a_thousand_is_further_from_all_points_than_their_gap():
-    corners = 2 * np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-    cloud = surface_cloud(corners, np.array([[0, 1, 2], [0, 2, 3]]), 5000, generator(3))
+    corners, faces = SQUARE
+    cloud = surface_cloud(2 * corners, faces, 5000, generator(3))
     places = np.column_stack([generator(4).uniform(0.2, 1.8, (40_000, 2)), np.zeros(40_000)])
     beyond = (nearest_m(cloud.points, places) > cloud.gap_m).mean()
     # some 20 places of one gap are beyond together, so that the share has a standard error of about 0.0003
@@ -100,8 +87,7 @@ def test_one_place_in_a_thousand_is_further_from_all_points_than_their_gap():
 
 
 def test_the_reconstruction_does_not_depend_on_the_order_of_returns():
-    y, z = np.meshgrid(np.linspace(-0.3, 0.3, 7), np.linspace(-0.3, 0.3, 7))
-    points = np.column_stack([np.ones(49), y.ravel(), z.ravel()])
+    _, points = plane_of_rays(7)
     vertices, faces = delaunay_surface(points, np.zeros(3))
     for seed in range(3):
         again_vertices, again_faces = delaunay_surface(generator(seed).permutation(points), np.zeros(3))
@@ -110,13 +96,10 @@ def test_the_reconstruction_does_not_depend_on_the_order_of_returns():
 
 
 def test_the_triangles_of_returns_tile_what_was_seen():
-    points = np.vstack([directions_around_x(60), [[1, y, z] for y, z in itertools.product((-0.6, 0.6), repeat=2)]])
-    points = points / points[:, :1]  # all on the plane x = 1, whose outermost returns are the corners of a square
-    vertices, faces = delaunay_surface(points, np.zeros(3))
-    a, b, c = np.moveaxis(vertices[faces], 1, 0)
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
-    assert area == pytest.approx(1.44)
-    np.testing.assert_allclose(sample_triangles(vertices, faces, 100, generator())[0][:, 0], 1.0)
+    inside = generator(4).uniform(-0.5, 0.5, (60, 2))
+    places = np.vstack([inside, list(itertools.product((-0.6, 0.6), repeat=2))])
+    # all on the plane x = 1, whose outermost returns are the corners of a square
+    assert area_through(np.column_stack([np.ones(64), places]), None) == pytest.approx(1.44)
 
 
 def test_every_triangle_is_delaunay_on_the_sphere_even_over_more_than_half_a_turn():
@@ -147,9 +130,8 @@ def test_returns_that_span_no_surface_give_none(points):
 
 
 def test_triangles_that_bridge_a_depth_step_can_be_left_out():
-    y, z = np.meshgrid(np.linspace(-0.3, 0.3, 13), np.linspace(-0.3, 0.3, 13))
-    depth = np.where(y.ravel() < 0.01, 1.0, 2.0)
-    points = depth[:, None] * np.column_stack([np.ones(169), y.ravel(), z.ravel()])
+    _, points = plane_of_rays()
+    points = points * np.where(points[:, 1:2] < 0.01, 1.0, 2.0)
     vertices, faces = delaunay_surface(points, np.zeros(3), steepest_deg=80)
     spans = np.ptp(vertices[faces][:, :, 0], axis=1)
     assert spans.max() == 0
@@ -219,44 +201,41 @@ def test_the_spacing_of_rays_is_that_of_their_grid_and_of_different_directions_a
 
 def test_the_visible_part_of_a_sphere_is_the_cap_that_faces_the_sensor():
     scene = Scene((Body(Sphere(0.5)),))
-    points = visible_surface_points(scene, looking_along_minus_x(), 2000, generator())
+    points = visible_surface(scene, looking_along_minus_x(), 2000, generator()).points
     lowest = 0.5**2 / 2.0  # x of the horizon seen from 2 m
     assert points.shape == (2000, 3)
     assert points[:, 0].min() >= lowest - 1e-3
     # area on a sphere is uniform in x (Archimedes)
     error = STANDARD_ERRORS * (0.5 - lowest) / math.sqrt(12 * 2000)
     assert abs(points[:, 0].mean() - (lowest + 0.5) / 2) < error
-
-
-def test_a_free_origin_sees_more_than_a_fixed_one():
-    scene = Scene((Body(Sphere(0.5)),))
-    wide = visible_surface_points(scene, looking_along_minus_x(box=1.0, half_angle=1.2), 3000, generator())
+    # a free origin sees more than a fixed one
+    wide = visible_surface(scene, looking_along_minus_x(box=1.0, half_angle=1.2), 3000, generator()).points
     assert wide[:, 0].min() < 0.0
 
 
 def test_angles_and_range_of_the_space_bound_what_counts_as_visible():
     scene = Scene((Body(Box((0.1, 2.0, 2.0))),))
-    points = visible_surface_points(scene, looking_along_minus_x(half_angle=0.3), 500, generator())
+    points = visible_surface(scene, looking_along_minus_x(half_angle=0.3), 500, generator()).points
     azimuth, elevation = angles(points - np.array([2.0, 0.0, 0.0]))
     assert np.abs(azimuth - math.pi).max() <= 0.3
     assert np.abs(elevation).max() <= 0.3
     with pytest.raises(DataError, match="no ray of the design space sees"):
-        visible_surface_points(scene, looking_along_minus_x(reach=1.8), 100, generator())
+        visible_surface(scene, looking_along_minus_x(reach=1.8), 100, generator())
 
 
 def test_what_an_occluder_hides_is_not_visible():
     plate = Body(Box((0.01, 0.5, 1.0)), "plate", "occluder", rigid(translation_m=(1.0, 0.5, 0.0)))
-    points = visible_surface_points(Scene((Body(Sphere(0.5)), plate)), looking_along_minus_x(), 500, generator())
+    points = visible_surface(Scene((Body(Sphere(0.5)), plate)), looking_along_minus_x(), 500, generator()).points
     assert points[:, 1].max() < 0.01
     hidden = Body(Box((0.01, 2.0, 2.0)), "wall", "occluder", rigid(translation_m=(1.0, 0.0, 0.0)))
     with pytest.raises(DataError, match="no ray of the design space sees"):
-        visible_surface_points(Scene((Body(Sphere(0.5)), hidden)), looking_along_minus_x(), 100, generator())
+        visible_surface(Scene((Body(Sphere(0.5)), hidden)), looking_along_minus_x(), 100, generator())
 
 
 def test_a_mesh_in_a_pose_is_seen_where_the_pose_puts_it():
     square = Mesh(np.array([[0.0, 0, 0], [0, 1, 0], [0, 0, 1]]), np.array([[0, 1, 2]]), "unsigned")
     scene = Scene((Body(square, poses=rigid(translation_m=(0.5, -0.2, 0.1))),))
-    points = visible_surface_points(scene, looking_along_minus_x(half_angle=1.0), 400, generator())
+    points = visible_surface(scene, looking_along_minus_x(half_angle=1.0), 400, generator()).points
     np.testing.assert_allclose(points[:, 0], 0.5, atol=1e-12)
     assert points[:, 1].min() >= -0.2
     assert points[:, 2].min() >= 0.1

@@ -33,11 +33,8 @@ def boxes():
     ]
 
 
-def ahead():
-    return [Scene((Body(Sphere(0.3), poses=rigid(translation_m=(2.0 + 0.1 * i, 0.05 * i, 0))),)) for i in range(3)]
-
-
-CASES = {"ceiling": (CEILING, balls()), "line": (LINE, ahead()), "fixed origin": (MEASURED, ahead())}
+AHEAD = [Scene((Body(Sphere(0.3), poses=rigid(translation_m=(2.0 + 0.1 * i, 0.05 * i, 0))),)) for i in range(3)]
+CASES = {"ceiling": (CEILING, balls()), "line": (LINE, AHEAD), "fixed origin": (MEASURED, AHEAD)}
 
 
 def distance_to_cells(grid, origins, directions, reach):
@@ -92,8 +89,7 @@ def test_probabilities_are_the_share_of_scenes_and_frames_that_a_cell_is_occupie
 
 def test_aiming_and_weighting_draw_the_same_rays():
     """Both ways to draw must agree where both can: with both angles free."""
-    train = ahead()
-    grid = occupancy_grid(train, MEASURED, seed=0)
+    grid = occupancy_grid(AHEAD, MEASURED, seed=0)
     aimed, worth = AimedPoints(grid, MEASURED, 0, 0).first(20_000)
     assert (worth == 1).all()
     uniform = replace(MEASURED, measure="solid_angle").sample(600_000, np.random.default_rng(1))

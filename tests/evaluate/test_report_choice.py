@@ -50,8 +50,7 @@ CURVE = [[0.1, 0.7], [0.2, 0.4]]
 def test_the_table_has_a_line_for_each_number_of_rays():
     entries = [entry(9, curve=CURVE), entry(16)]
     text = section_of(design_of(entries), evaluation_of(SCORES))
-    assert text.count('<tr><th scope="row"') + text.count('<tr class=first><th scope="row"') == 2
-    assert text.count("5.0 %") == 2
+    assert text.count('<th scope="row"') == text.count("5.0 %") == 2
     assert "loss [m]" in text
 
 
@@ -83,7 +82,7 @@ def test_of_too_few_or_equal_choices_no_correlation_is_said(pairs):
     assert correlation_sentence(pairs, evaluation_of(SCORES)) == ""
 
 
-@pytest.mark.parametrize("curve", [None, "a", [1, 2], [[1.0]], [[1.0, float("nan")]], [["a", 1.0]]])
+@pytest.mark.parametrize("curve", [None, "a", [1, 2], [[1.0]], [[1.0, float("nan")]]])
 def test_what_a_file_does_not_hold_whole_is_left_out(curve):
     text = section_of(design_of([entry(9, curve=curve)]), evaluation_of(SCORES))
     assert "choice-curve" not in text

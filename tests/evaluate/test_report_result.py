@@ -33,7 +33,7 @@ def test_only_pairs_at_the_number_of_rays_of_its_row_are_told():
     assert evaluation.headline_pairs == {"f": told}
     text = result_section(evaluation, [])
     assert text.count('class="verdict"') == 2
-    assert "The strongest baseline is greedy, the best of 2 on 20 training scenes." in text
+    assert "the best of 2 on 20 training scenes" in text
 
 
 def test_a_design_without_the_middle_number_of_rays_is_shown_at_the_closest():
@@ -45,16 +45,15 @@ def test_a_design_without_the_middle_number_of_rays_is_shown_at_the_closest():
 
 def test_without_baselines_every_design_has_its_score():
     text = result_section(evaluation_of(baseline=None), [])
-    assert "f: 5 mm at 25 rays." in text
+    assert "f: 5.00 mm at 25 rays." in text
     assert "difference" not in text
 
 
 def test_of_many_designs_the_best_is_told_about_and_many_notes_are_folded():
     pairs = [pair(-0.6, -0.9, -0.3, name=f"f{number}") for number in range(5)]
     text = result_section(evaluation_of(*pairs, notes=[f"note {number}" for number in range(5)]), [])
-    assert "Against greedy: f0, f1, f2, f3 and f4 are better." in text
     assert len(re.findall("<td class=.better.>better", text)) == 5
-    assert "<summary>Further notes (3 rows)</summary>" in text
+    assert "Further notes (3 rows)" in text
 
 
 @pytest.mark.parametrize("rays", [25, 9])

@@ -2,6 +2,7 @@
 
 import csv
 import io
+from dataclasses import replace
 
 import pytest
 from support.evaluations import make_evaluation
@@ -17,11 +18,9 @@ SPACE = DesignSpace((0, 0, 0, -0.3, -0.3, 1.0), (0, 0, 0, 0.3, 0.3, 5.0))
 
 
 def test_a_design_without_constraints_has_no_bounds_but_those_of_its_space():
-    free = constraint_slack_of(DesignSpec("free", (normal_sensor(range_m=3.0, spread_range_m=0.2),)), SPACE)
-    assert {one.name.split(".")[0] for one in free} == {"space"}
-    bound = DesignSpec(
-        "bound", (normal_sensor(range_m=3.0, spread_range_m=0.2),), constraints={"gate": {"width_m": {"max": 1.0}}}
-    )
+    free = DesignSpec("free", (normal_sensor(range_m=3.0, spread_range_m=0.2),))
+    assert {one.name.split(".")[0] for one in constraint_slack_of(free, SPACE)} == {"space"}
+    bound = replace(free, constraints={"gate": {"width_m": {"max": 1.0}}})
     (row,) = [one for one in constraint_slack_of(bound, SPACE) if one.name == "gate.width_m.max"]
     assert row.room == pytest.approx(1.0 - 2 * 1.959964 * 0.2, abs=1e-5)
 
@@ -52,8 +51,7 @@ def test_the_table_holds_every_row_with_units_in_its_header(tmp_path):
     text = (tmp_path / "rows.csv").read_text(encoding="utf-8")
     assert text == csv_text(evaluation)
     header, *lines = csv.reader(io.StringIO(text))
-    assert "Chamfer distance [mm]" in header
-    assert "bandwidth [Mbit/s]" in header
+    assert {"Chamfer distance [mm]", "bandwidth [Mbit/s]"} <= set(header)
     assert len(lines) == len(evaluation.rows) + len(evaluation.equal_bandwidth)
     assert lines[0][0] == "with, comma"
     assert float(lines[0][2]) == evaluation.rows[0].value

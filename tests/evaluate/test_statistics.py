@@ -40,7 +40,7 @@ def test_the_end_towards_which_values_are_skewed_is_further_out_and_none_is_near
     np.testing.assert_allclose(mirrored, [-interval.mean, -interval.high, -interval.low])
 
 
-@pytest.mark.parametrize("groups", [10, 20, 50])
+@pytest.mark.parametrize("groups", [10, 50])
 @pytest.mark.parametrize("sizes", [(4,), (2, 3, 4, 5, 6)], ids=["even", "uneven"])
 @pytest.mark.parametrize("name", SKEWED)
 def test_intervals_cover_the_truth_also_of_skewed_scores(name, sizes, groups):
@@ -100,21 +100,6 @@ def test_repeating_every_scene_within_its_group_changes_nothing(count):
     np.testing.assert_allclose(repeated, mean_interval(values), atol=1e-12)
 
 
-def test_the_order_of_scenes_within_groups_does_not_matter():
-    generator = np.random.default_rng(3)
-    values, groups = generator.normal(size=60), generator.integers(0, 12, 60)
-    order = generator.permutation(60)
-    np.testing.assert_allclose(mean_interval(values[order], groups[order]), mean_interval(values, groups), atol=1e-12)
-
-
-def test_intervals_over_scenes_of_few_groups_do_not_cover_the_truth():
-    generator, members, covered = np.random.default_rng(5), np.repeat(np.arange(30), 8), 0
-    for _ in range(300):
-        values = generator.normal(size=30)[members] + 0.3 * generator.normal(size=len(members))
-        covered += mean_interval(values).low <= 0.0 <= mean_interval(values).high
-    assert covered / 300 < 0.65
-
-
 def test_unequal_groups_have_the_spread_of_leaving_out_each_and_are_worth_fewer_of_equal_size():
     values, groups = np.array([1.0, 2.0, 6.0, 3.0, 5.0]), np.array([0, 0, 1, 2, 2])
     without = np.array([values[groups != group].mean() for group in range(3)])
@@ -122,20 +107,6 @@ def test_unequal_groups_have_the_spread_of_leaving_out_each_and_are_worth_fewer_
     interval = mean_interval(values, groups)
     nearer = min(interval.mean - interval.low, interval.high - interval.mean)
     assert nearer == pytest.approx(t.ppf(0.975, 25 / 9 - 1) * error)
-
-
-def test_shifting_shifts_the_interval():
-    values = np.random.default_rng(2).gamma(2.0, 1.0, 30)
-    np.testing.assert_allclose(np.array(mean_interval(values + 10)) - 10, mean_interval(values), atol=1e-12)
-
-
-def test_a_paired_difference_ignores_what_the_scenes_share():
-    generator = np.random.default_rng(4)
-    scenes = generator.normal(0.0, 100.0, 50)
-    mean, low, high = paired_difference(scenes + 1.0, scenes + generator.normal(0.0, 0.1, 50))
-    assert low > 0.9
-    assert high < 1.1
-    assert mean == pytest.approx(1.0, abs=0.1)
 
 
 def test_swapping_the_pair_turns_the_sign():

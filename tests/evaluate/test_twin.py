@@ -36,9 +36,7 @@ CASES = {
     "along": {"sensors": 1},
     "at one place": {"sensors": 1, "at": {"x_m": 0.4}},
 }
-
-
-SAMPLES = 20_000
+SAMPLES = 3000
 
 
 @pytest.fixture(autouse=True)
@@ -49,8 +47,15 @@ def few_samples(monkeypatch):
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
     place = tmp_path_factory.mktemp("runs")
-    plain, along = make_run(place / "plain"), make_conditioned_run(place / "along")
-    return {case: RunFolder.open(along if case in ("along", "at one place") else plain) for case in CASES}
+    plain, along = (few_scenes(run) for run in (make_run(place / "plain"), make_conditioned_run(place / "along")))
+    return {case: along if case in ("along", "at one place") else plain for case in CASES}
+
+
+def few_scenes(folder):
+    """A run whose density is that of four training scenes."""
+    opened = RunFolder.open(folder)
+    task = opened.config.task.model_copy(update={"train": 4})
+    return replace(opened, config=replace(opened.config, task=task))
 
 
 def fit(run, case, visibility):

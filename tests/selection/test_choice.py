@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from support.coverages import SUMS, relaxed_by_highs, small
 
@@ -66,31 +66,33 @@ class TestAChoice:
     def test_gains_are_the_differences_of_worth_and_shrink_as_others_are_taken(self, table, seed):
         coverage = small(seed, table=table)
         rays, gates = coverage.shape
-        few = np.full(rays, -1)
-        few[0] = 0
-        more = few.copy()
-        more[1] = 1
-        gains = {}
-        for name, gate in (("few", few), ("more", more)):
-            gains[name] = coverage.gains(coverage.known(gate))
+        few, more = np.full((2, rays), -1)
+        few[0], more[:2] = 0, (0, 1)
+        fewer, further = (coverage.gains(coverage.known(gate)) for gate in (few, more))
+        for gate, gains in ((few, fewer), (more, further)):
             for ray, choice in itertools.product(range(2, rays), range(gates)):
-                added = gate.copy()
-                added[ray] = choice
+                added = np.where(np.arange(rays) == ray, choice, gate)
                 gain = coverage.value_of(added) - coverage.value_of(gate)
-                assert gains[name][ray, choice] == pytest.approx(gain, abs=1e-12)
-        assert (gains["more"][2:] <= gains["few"][2:] + 1e-12).all()
+                assert gains[ray, choice] == pytest.approx(gain, abs=1e-12)
+        assert (further[2:] <= fewer[2:] + 1e-12).all()
 
-    @given(seed=seeds, price=st.sampled_from([0.0, 0.05, 0.3]), most=st.integers(1, 3))
-    def test_is_near_the_best_of_all_and_its_certificate_above_it(self, table, seed, price, most):
+    @given(
+        seed=seeds, price=st.sampled_from([0.0, 0.05, 0.3]), most=st.integers(1, 3),
+        share=st.none() | st.floats(0.1, 1.2),
+    )  # fmt: skip
+    def test_is_not_above_the_best_of_all_and_its_certificate_not_below(self, table, seed, price, most, share):
         coverage, counts = small(seed, table=table, harm=0.05), RayCounts(np.arange(7) % 2, np.array([most, 1]))
-        choice = choose(coverage, counts, price=price, full=False)
-        best = best_of_all(coverage, every_choice(coverage, counts), price)
-        value, bound = certify(coverage, counts, choice, full=False)
+        choice, budget = choose(coverage, counts, price=price, full=False), None
+        if share is not None:
+            price, budget = 0.0, share * choose(coverage, counts).bits
+            choice = choose_within(coverage, counts, budget, full=False)
+            assert choice.bits <= budget
+        best = best_of_all(coverage, every_choice(coverage, counts), price, np.inf if budget is None else budget)
+        value, bound = certify(coverage, counts, choice, budget_mbps=budget, full=False)
         assert value <= best + 1e-12
         assert bound >= best - 1e-12
         assert (np.bincount(counts.group[choice.rays], minlength=2) <= counts.most).all()
 
-    @settings(max_examples=60)
     @given(
         seed=seeds, harm=st.sampled_from([0.05, 0.5, 3.0]), price=st.sampled_from([0.0, 0.05]),
         share=st.none() | st.floats(0.5, 1.2), owned=st.booleans(), most=st.integers(2, 9), banned=st.booleans(),
@@ -123,28 +125,14 @@ class TestAChoice:
         assert 0.1 + 0.1 + 0.1 > 0.3
         assert len(choose_within(coverage, RayCounts.of_one(len(coverage.bits), 3), 0.3).rays) == 3
 
-    @given(seed=seeds, share=st.floats(0.1, 1.2))
-    def test_within_a_budget_is_near_the_best_of_all_and_its_certificate_above_it(self, table, seed, share):
-        coverage, counts = small(seed, table=table), RayCounts.of_one(7, 3)
-        budget = share * choose(coverage, counts).bits
-        choice = choose_within(coverage, counts, budget, full=False)
-        best = best_of_all(coverage, every_choice(coverage, counts), budget_mbps=budget)
-        _, bound = certify(coverage, counts, choice, budget_mbps=budget, full=False)
-        assert choice.bits <= budget
-        assert choice.worth <= best + 1e-12
-        assert bound >= best - 1e-12
-
     @pytest.mark.parametrize(("price", "share"), [(0.0, None), (0.05, None), (0.0, 0.5)])
     def test_loses_little_against_the_best_of_all(self, table, price, share):
         ratios = []
-        for seed in range(30):
+        for seed in range(15):
             coverage, counts = small(seed, table=table), RayCounts.of_one(7, 3)
             budget = np.inf if share is None else share * choose(coverage, counts).bits
-            choice = (
-                choose_within(coverage, counts, budget, full=False)
-                if share
-                else choose(coverage, counts, price=price, full=False)
-            )
+            choice = choose(coverage, counts, price=price, full=False)
+            choice = choose_within(coverage, counts, budget, full=False) if share else choice
             best = best_of_all(coverage, every_choice(coverage, counts), price, budget)
             ratios.append((choice.worth - price * choice.bits) / best)
         assert np.mean(ratios) >= 0.98
@@ -160,7 +148,7 @@ class TestAChoice:
     def test_fires_a_ray_of_each_sensor_where_it_has_to_and_is_near_the_best_of_those(self, table, most, price):
         owner, losses = np.array([0, 0, 1, 1, 1, 2, 2]), []
         counts = RayCounts(np.zeros(7, dtype=int), np.array([most]), owner)
-        for seed in range(20):
+        for seed in range(8):
             coverage = small(seed, table=table)
             choice = choose(coverage, counts, price=price)
             assert len(choice.rays) == most

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from lidardesign_tasks.flatland import FlatlandTask
+from lidardesign_tasks.meshes import MeshesTask
 from support.command_line import make_run
 from support.conditioned_runs import make_conditioned_run
 from support.mesh_runs import make_mesh_run
@@ -20,14 +24,23 @@ from lidardesign.sensors.sensor import tangent_coordinates
 FIELD_RAD = 2e-7  # by which fields may be wider than their rays: digits of angles in files
 
 
+@pytest.fixture(autouse=True)
+def few_scenes(monkeypatch):
+    """Rays are chosen on three scenes, for two numbers where none is asked for."""
+    for task in (FlatlandTask, MeshesTask):
+        monkeypatch.setattr(task, "defaults", replace(task.defaults, rays=(8, 24)))
+    for module in ("rays.information", "rays.training", "rays.selection", "fitting.chosen", "fitting.trials"):
+        monkeypatch.setattr(f"lidardesign.{module}.FEW_SCENES", 3)
+
+
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
     """Runs whose sensors stand at a given place, may choose one, and move along a condition."""
     place = tmp_path_factory.mktemp("runs")
     folders = {
-        "given": make_mesh_run(place / "given"),
+        "given": make_mesh_run(place / "given", count=1500),
         "free": make_run(place / "free"),
-        "moving": make_conditioned_run(place / "moving", count=12_000),
+        "moving": make_conditioned_run(place / "moving", count=6000),
     }
     return {name: open_run(folder) for name, folder in folders.items()}
 
@@ -54,10 +67,9 @@ def test_fields_and_gates_are_as_small_as_their_rays_allow(runs, name, gates):
     assert design.counts == sorted(runs[name].task.defaults.rays)
     for index, sensor in enumerate(design.sensors):
         tangent, gate_m = of_sensor(design, index)
-        free = np.array(sensor.field_of_view_rad) > 0
-        reached = 2 * np.abs(tangent[:, free]).max(axis=0)
-        assert (reached <= np.array(sensor.field_of_view_rad)[free]).all()
-        assert (reached >= np.array(sensor.field_of_view_rad)[free] - FIELD_RAD).all()
+        field_rad = np.array(sensor.field_of_view_rad)
+        spare_rad = (field_rad - 2 * np.abs(tangent).max(axis=0))[field_rad > 0]
+        assert ((spare_rad >= 0) & (spare_rad <= FIELD_RAD)).all()
         assert sensor.gate_m == (gate_m[:, 0].min(), gate_m[:, 1].max())
         assert (gates == "ray") == (len(np.unique(gate_m, axis=0)) > 1)
         if name == "given":
@@ -80,14 +92,9 @@ def test_they_do_not_shrink_below_what_constraints_ask_for(runs, name, gates):
     design = runs["given"].fit(sensors=2, rays=36, gates=gates, constraints=MINIMA[name]).specification
     for index, sensor in enumerate(design.sensors):
         _, gate_m = of_sensor(design, index)
-        widths = np.diff(gate_m, axis=1)
-        if name == "fields":
-            assert np.degrees(sensor.field_of_view_rad) == pytest.approx([30, 20], rel=1e-6)
-        elif name == "a gate":
-            assert widths.min() >= 1.2 - 1e-9
-        else:
-            assert gate_m[:, 0].max() <= 1.9
-            assert gate_m[:, 1].min() >= 3.4
+        assert name != "fields" or np.degrees(sensor.field_of_view_rad) == pytest.approx([30, 20], rel=1e-6)
+        assert name != "a gate" or np.diff(gate_m, axis=1).min() >= 1.2 - 1e-9
+        assert name != "ends of gates" or gate_m[:, 0].max() <= 1.9 < 3.4 <= gate_m[:, 1].min()
 
 
 RULES = {
@@ -95,17 +102,12 @@ RULES = {
     "least widths": {"gate": {"width_m": {"min": 0.05, "max": 1.5}}},
     "fields": {"field_of_view": {"horizontal_deg": {"max": 12}, "vertical_deg": {"max": 8}}},
     "boresights": {"boresight": {"azimuth_deg": {"min": 175, "max": 178}, "elevation_deg": {"max": 0}}},
-    "bandwidth": {"budget": {"bandwidth_mbps": 0.6}},
     "tight bandwidth": {"budget": {"bandwidth_mbps": 0.2}},
     "bins": {"budget": {"bandwidth_mbps": 0.5, "bin_ps": 300.0, "bits_per_bin": 16, "rate_hz": 30}},
-    "each": {
-        "gate": {"end_m": {"max": 3.2}},
-        "each": [{"gate": {"end_m": {"max": 2.7}}}, {"gate": {"start_m": {"min": 2.3}}}],
-    },
     "all": {
         "gate": {"width_m": {"max": 0.8}},
         "budget": {"bandwidth_mbps": 0.5},
-        "each": [{"gate": {"end_m": {"max": 2.7}}}],
+        "each": [{"gate": {"end_m": {"max": 2.7}}}, {"gate": {"start_m": {"min": 2.3}}}],
     },
 }
 
@@ -131,16 +133,13 @@ def test_rays_start_all_over_a_region_where_constraints_allow_one_and_else_at_th
             assert origin or (own == sensor.origin_m).all()
 
 
-@pytest.mark.parametrize(("name", "sensors"), [("given", 4), ("given", 12), ("free", 5), ("moving", 4)])
-@pytest.mark.parametrize("seed", range(2))
-def test_where_a_number_of_sensors_was_asked_for_each_of_them_fires(runs, name, sensors, seed):
-    design = runs[name].fit(sensors=sensors, rays=sensors, seed=seed).specification
+@pytest.mark.parametrize(("name", "sensors"), [("given", 12), ("free", 5), ("moving", 4)])
+def test_where_a_number_of_sensors_was_asked_for_each_of_them_fires(runs, name, sensors):
+    design = runs[name].fit(sensors=sensors, rays=sensors, seed=1).specification
     assert design.rays_per_sensor().tolist() == [1] * sensors
 
 
-@pytest.mark.parametrize(
-    ("name", "most", "open_below"), [("given", 12, 12), ("given", 12, 1), ("free", 5, 1), ("moving", 4, 3)]
-)
+@pytest.mark.parametrize(("name", "most", "open_below"), [("given", 12, 12), ("free", 3, 1), ("moving", 3, 2)])
 def test_where_the_number_is_free_no_sensor_is_idle_and_none_is_left_out_that_constraints_ask_for(
     runs, name, most, open_below, monkeypatch
 ):
@@ -167,26 +166,19 @@ def test_more_sensors_than_samples_carry_are_fitted_again_with_fewer(runs, monke
     design = runs["given"].fit(rays=36, notes=notes.append).specification
     assert asked[:4] == [5, 5, 4, 3]
     assert len(design.sensors) == asked[-1] <= 3
-    again = [note for note in notes if "fitted again" in note]
-    assert again[:2] == [f"too few samples: fitted again with {count}" for count in (4, 3)]
+    assert len([note for note in notes if "fitted again" in note]) >= 2
 
 
-@pytest.mark.parametrize("name", ["given", "moving"])
-def test_the_middle_number_is_certified_and_every_one_where_that_is_asked_for_with_the_same_rays(runs, name):
-    few, every = (runs[name].fit(sensors=1, certify=certify).specification for certify in (False, True))
-    assert [one["rays"] for one in few.certificates] == [few.counts[len(few.counts) // 2]]
-    assert [one["rays"] for one in every.certificates] == every.counts
+def test_where_every_number_is_certified_rays_are_the_same(runs):
+    few, every = (runs["given"].fit(sensors=1, certify=certify).specification for certify in (False, True))
     assert few.certificates[0] in every.certificates
     documents = [design_document(one) | {"certificates": []} for one in (few, every)]
     assert dump_yaml(documents[0]) == dump_yaml(documents[1])
 
 
-@pytest.mark.parametrize("name", ["free", "moving"])
-def test_two_workers_find_the_same_bytes_as_one(runs, name):
-    alone, shared = (
-        dump_yaml(design_document(runs[name].fit(sensors=2, seed=5, workers=workers).specification))
-        for workers in (1, 2)
-    )
+def test_two_workers_find_the_same_bytes_as_one(runs):
+    fitted = [runs["moving"].fit(sensors=2, rays=12, seed=5, workers=workers).specification for workers in (1, 2)]
+    alone, shared = (dump_yaml(design_document(one)) for one in fitted)
     assert alone == shared
 
 

@@ -96,9 +96,7 @@ def test_where_no_target_is_met_nothing_is_known_or_asked_for(body):
     generator = np.random.default_rng(0)
     returns = returns_at(square(generator, 9), np.full(9, body))
     found = surface_information([square(generator, 20)], [returns], [True, False], SIDE_M**2)
-    assert len(found.ray) == 0
-    assert len(found.frame) == 20
-    assert found.complete == 0
+    assert (len(found.ray), len(found.frame), found.complete) == (0, 20, 0)
     assert not found.harm.any()
 
 

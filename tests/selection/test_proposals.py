@@ -39,10 +39,18 @@ SENSORS = {
 }
 
 
-def proposed(kind, count, seed=0, samples=CEILING, sensors=None):
-    rules = Constraints.from_mapping(RULES[kind]).rules
-    proposals = Proposals(SENSORS[kind] if sensors is None else sensors, rules, LEVEL, samples)
-    return proposals.draw(count, {}, np.random.default_rng(seed))
+def rules_of(kind):
+    return Constraints.from_mapping(RULES[kind]).rules
+
+
+def proposed(kind, count, seed=0, samples=CEILING, least=None):
+    proposals = Proposals(SENSORS[kind], rules_of(kind), LEVEL, samples)
+    return proposals.draw(count, {}, np.random.default_rng(seed), least)
+
+
+def owned_by(kind, samples):
+    """Which sensor owns each sample, and what it fires there."""
+    return owners(SENSORS[kind], rules_of(kind), LEVEL, samples.points, samples.space)
 
 
 def rows(rays):
@@ -81,10 +89,8 @@ class TestCandidates:
             if kind == "places":
                 np.testing.assert_array_equal(own.origin_m, np.tile(sensor.origin_m, (len(own), 1)))
             else:
-                away = own.origin_m[:, :2] - sensor.origin_m[:2]
-                squares = np.einsum("ni,ni->n", away, np.linalg.solve(sensor.covariance_m2[:2, :2], away.T).T)
                 # the ellipse of the level in the plane of the ceiling
-                assert squares.max() <= -2 * math.log(1 - LEVEL) + 1e-9
+                assert squares(own.origin_m, sensor).max() <= -2 * math.log(1 - LEVEL) + 1e-9
                 assert len(np.unique(own.origin_m, axis=0)) == len(own)
 
     def test_look_at_what_samples_look_at_within_their_gates(self, kind):
@@ -98,9 +104,8 @@ class TestCandidates:
         assert ((reached >= rays.gate_m[:, 0]) & (reached < rays.gate_m[:, 1])).all()
 
     def test_belong_to_the_sensor_whose_component_is_densest_there(self, kind):
-        sensors, rules = SENSORS[kind], Constraints.from_mapping(RULES[kind]).rules
-        owner, fired = owners(sensors, rules, LEVEL, CEILING.points, CEILING.space)
-        naive = np.array([naive_log_density(sensor, CEILING) for sensor in sensors])
+        owner, fired = owned_by(kind, CEILING)
+        naive = np.array([naive_log_density(sensor, CEILING) for sensor in SENSORS[kind]])
         owned = owner >= 0
         assert owned.mean() > 0.5
         np.testing.assert_array_equal(owner[owned], naive.argmax(axis=0)[owned])
@@ -121,8 +126,7 @@ class TestCandidates:
 
     def test_are_even_only_where_samples_inside_are_too_few(self, kind):
         sensors, few = SENSORS[kind], CEILING.subset(np.arange(80))
-        rules = Constraints.from_mapping(RULES[kind]).rules
-        inside = int((owners(sensors, rules, LEVEL, few.points, few.space)[0] >= 0).sum())
+        inside = int((owned_by(kind, few)[0] >= 0).sum())
         assert 10 < inside < 80
         exact, more = (proposed(kind, count, samples=few) for count in (inside, inside + 30))
         assert len(rows(exact)) == inside
@@ -132,24 +136,20 @@ class TestCandidates:
 
     @given(seed=seeds, count=st.integers(1, 20), least=st.lists(st.integers(0, 60), min_size=3, max_size=3))
     def test_are_as_many_of_each_sensor_as_it_has_to_have_its_own_samples_first(self, kind, seed, count, least):
-        sensors, least = SENSORS[kind], np.array(least)
-        few = CEILING.subset(np.arange(80))
-        rules = Constraints.from_mapping(RULES[kind]).rules
-        proposals = Proposals(sensors, rules, LEVEL, few)
-        plain, rays = (proposals.draw(count, {}, np.random.default_rng(seed), one) for one in (None, least))
+        least, few = np.array(least), CEILING.subset(np.arange(80))
+        plain, rays = (proposed(kind, count, seed, few, one) for one in (None, least))
         assert rows(plain) <= rows(rays)
         own = np.bincount(rays.sensor, minlength=3)
         np.testing.assert_array_equal(own, np.maximum(np.bincount(plain.sensor, minlength=3), least))
-        owned = np.bincount(owners(sensors, rules, LEVEL, few.points, few.space)[0] + 1, minlength=4)[1:]
-        even = rows(even_rays(sensors, np.maximum(least - owned, 0)))
+        owned = np.bincount(owned_by(kind, few)[0] + 1, minlength=4)[1:]
+        even = rows(even_rays(SENSORS[kind], np.maximum(least - owned, 0)))
         assert rows(rays) & even == even
         assert len(rows(rays) - even) == np.minimum(own, owned).sum()
 
     def test_are_as_frequent_as_samples_weigh_and_none_that_weighs_nothing(self, kind):
-        heavy, draws = np.arange(200) % 2 == 0, 300
+        heavy, draws = np.arange(200) % 2 == 0, 150
         samples = replace(CEILING.subset(np.arange(200)), log_target=np.where(heavy, 2.0, 0.0), log_prob=np.zeros(200))
-        rules = Constraints.from_mapping(RULES[kind]).rules
-        owner, fired = owners(SENSORS[kind], rules, LEVEL, samples.points, samples.space)
+        owner, fired = owned_by(kind, samples)
         weight = np.where(heavy, math.exp(2), 1.0)[owner >= 0]
         number = {tuple(point): index for index, point in enumerate(direction(*fired[owner >= 0, 3:5].T))}
         drawn = np.zeros(len(weight), dtype=int)
@@ -174,10 +174,14 @@ def naive_log_density(sensor, samples):
     angle = np.hypot(*tangent.T)
     value += np.log(angle / np.sin(angle))
     if sensor.origin_covariance_m2 is not None:
-        flat = sensor.origin_covariance_m2[:2, :2]
-        off = points[:, :2] - sensor.origin_m[:2]
-        value -= 0.5 * np.einsum("ni,ni->n", off, np.linalg.solve(flat, off.T).T) + 0.5 * np.linalg.slogdet(flat)[1]
+        value -= 0.5 * squares(points, sensor) + 0.5 * np.linalg.slogdet(sensor.origin_covariance_m2[:2, :2])[1]
     return value
+
+
+def squares(points, sensor):
+    """Squared distances from a sensor's origin over the ceiling, in its standard deviations, (N,)."""
+    away = points[:, :2] - sensor.origin_m[:2]
+    return np.einsum("ni,ni->n", away, np.linalg.solve(sensor.origin_covariance_m2[:2, :2], away.T).T)
 
 
 def test_the_same_ray_at_another_range_is_the_same_candidate():

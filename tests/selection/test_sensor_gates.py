@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -19,13 +20,13 @@ from lidardesign.task import Information
 
 seeds = st.integers(0, 10_000)
 VISITS = [slice(0, 12)]
+SENSOR = np.repeat([0, 1, 2], 4)
 
 
 def cast(seed, silent=()):
     """Rays of three sensors, and what scenes tell through them; those of silent sensors tell nothing."""
     generator = np.random.default_rng(seed)
-    rays = rays_along(random_fan(12, 1.0, seed), gate_m=(0.2, 3.0))
-    rays = type(rays)(*{**vars(rays), "sensor": np.repeat([0, 1, 2], 4)}.values())
+    rays = replace(rays_along(random_fan(12, 1.0, seed), gate_m=(0.2, 3.0)), sensor=SENSOR)
     informed = []
     for _ in range(4):
         range_m = generator.uniform(0.5, 1.5, 12) + 0.6 * rays.sensor
@@ -81,7 +82,6 @@ class TestGatesOfASensor:
         assert (fewer[rays.sensor == 1] == rays.gate_m[rays.sensor == 1][:, None]).all()
 
 
-SENSOR = np.repeat([0, 1, 2], 4)
 GATES_M = np.array([[[0.0, 3.0], [1.0, 2.0], [1.2, 1.8], [1.4, 1.6]], [[0.5, 2.5], [1.0, 1.9], [1.3, 1.7], [1.5, 1.6]]])
 
 
@@ -113,6 +113,7 @@ class TestTheGateThatRaysShare:
             other = shared.copy()
             other[index] = gate
             assert worth(coverage, choice, other)[0] <= best + 1e-6
+        assert price > 0 or (shared == 0).all()
 
     @given(seed=seeds, share=st.floats(0, 1.2))
     def test_is_narrower_only_where_rays_cost_too_much(self, seed, share, price):
@@ -125,8 +126,3 @@ class TestTheGateThatRaysShare:
         assert worth(coverage, choice, shared)[1] <= max(limit, narrowest) * (1 + 1e-8)
         if share > 1 + 1e-9:
             np.testing.assert_array_equal(shared, free)
-
-    def test_of_no_price_and_no_limit_is_open(self, price):
-        coverage, choice = chosen(0, price)
-        shared = _shared_gates(coverage, choice, SENSOR, np.inf)
-        assert (shared == 0).all() == (price == 0)

@@ -109,16 +109,13 @@ class TestDesigns:
         assert 0 <= entry["bound"] <= entry["value"]
         assert (entry["rays"], entry["candidates"], entry["gates"]) == (150, 15, 1)
 
-    @pytest.mark.parametrize("form", ["sdf", "urdf", "xacro", "carla"])
-    def test_are_exported_exactly_where_formats_fire_even_grids(self, run, tmp_path, form):
-        design = open_run(run).fit(layout="spinning", channels=3, rays=150, name="spun")
-        exported = design.export(tmp_path / "spun", format=form)
-        assert any("every channel is a sensor of its own" in note for note in exported.notes)
-        # and none of rays that had to move, or were added
-        assert not any("even grids" in note for note in exported.notes)
-
-    def test_keep_their_channels_when_they_are_constrained(self, run):
+    def test_are_exported_exactly_where_formats_fire_even_grids_and_keep_their_channels(self, run, tmp_path):
         design = open_run(run).fit(layout="spinning", channels=2, rays=60, name="spun")
+        for form in ("sdf", "urdf", "xacro", "carla"):
+            exported = design.export(tmp_path / form, format=form)
+            assert any("every channel is a sensor of its own" in note for note in exported.notes)
+            # and none of rays that had to move, or were added
+            assert not any("even grids" in note for note in exported.notes)
         again = design.constrain(constraints={"gate": {"end_m": {"max": 5.0}}})
         assert (again.specification.layout, again.specification.provenance["channels"]) == ("spinning", 2)
 
@@ -137,7 +134,6 @@ class TestDesigns:
         assert refused.code == 2
         assert says in refused.err
 
-    def test_need_elevations_to_choose_among(self, lidardesign, tmp_path):
-        refused = lidardesign("fit", make_run(tmp_path / "flat"), "--layout", "spinning", "--rays", 16)
-        assert refused.code == 2
-        assert "16 channels" in refused.err
+    def test_need_elevations_to_choose_among(self, tmp_path):
+        with pytest.raises(ConfigError, match="16 channels"):
+            open_run(make_run(tmp_path / "flat")).fit(layout="spinning", rays=16)

@@ -16,10 +16,11 @@ from lidardesign.samples import Samples
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import Outcome, Rays, gate_outcomes
 from lidardesign.scenes.scene import Body, Box, Capsule, Plane, Scene, Sphere, rigid
-from lidardesign.scoring.evaluation.results import Evaluation, Paired, Row
+from lidardesign.scoring.evaluation.results import Evaluation, Paired
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.space import DesignSpace
 from lidardesign.task import Metric
+from support.evaluations import make_row
 from support.sensors import normal_sensor
 
 METRIC = Metric("Chamfer <distance>", "mm", "lower", worst=200.0, tolerance=0.1)
@@ -27,12 +28,6 @@ NASTY = "</script><script>alert(1)</script><img src=x onerror=alert(2)>\"'&"
 PLACES = tuple({"y_m": value} for value in (-0.3, 0.0, 0.3))
 FRAMES = 4
 SPACE = DesignSpace((0, -0.5, 0, -0.6, -0.3, 0.5), (0, 0.5, 0, 0.6, 0.3, 4.0))
-
-
-def make_row(name, rays, value, baseline=False, matched_to=None):
-    matched_rays = rays if matched_to else None
-    values = np.array([value])
-    return Row(name, rays, value, value, value, 0, 0.1, 0.5, values, baseline, matched_to, matched_rays)
 
 
 def make_evaluation(*names):
