@@ -70,16 +70,16 @@ def run_here(monkeypatch, capsys, common):
     torch.set_rng_state(state)
 
 
-@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
-def test_a_benchmark_imports_and_explains_itself(script, run_here, capsys):
-    if script.stem == "em":
+@pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
+def test_a_benchmark_imports_and_explains_itself(path, run_here, capsys):
+    if path.stem == "em":
         pytest.importorskip("sklearn")
     with pytest.raises(SystemExit) as ended:
-        run_here(script.stem, "--help")
+        run_here(path.stem, "--help")
     assert not ended.value.code
     told = capsys.readouterr().out
     assert told.startswith("usage:")
-    assert f"benchmarks/{script.name}" in " ".join(told.split())
+    assert f"benchmarks/{path.name}" in " ".join(told.split())
 
 
 def test_every_benchmark_is_documented():
