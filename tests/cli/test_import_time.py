@@ -13,7 +13,9 @@ from support.command_line import make_run
 
 import lidardesign
 
-HEAVY = ["torch", "zuko", "numba", "scipy", "trimesh", "igl", "embreex", "h5py", "matplotlib", "plotly", "numpy.f2py"]
+# scipy by itself takes four milliseconds, and its parts come when they are used
+PARTS = [f"scipy.{part}" for part in ("linalg", "optimize", "sparse", "spatial", "special", "stats")]
+HEAVY = ["torch", "zuko", "numba", *PARTS, "trimesh", "igl", "embreex", "h5py", "matplotlib", "plotly", "numpy.f2py"]
 NUMERIC = ["numpy", "yaml"]
 
 

@@ -107,7 +107,9 @@ def test_the_readme_is_short():
 
 
 def test_the_documentation_is_short():
-    assert len(README.split()) + sum(len(page.read_text("utf-8").split()) for page in DOCS.rglob("*.md")) <= MOST_WORDS
+    # dated protocols of long runs are evidence
+    pages = [page for page in DOCS.rglob("*.md") if page.parent == DOCS or page.name == "README.md"]
+    assert len(README.split()) + sum(len(page.read_text("utf-8").split()) for page in pages) <= MOST_WORDS
 
 
 def test_every_page_is_in_the_navigation():
