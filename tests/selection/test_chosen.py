@@ -29,7 +29,7 @@ def few_scenes(monkeypatch):
     """Rays are chosen on three scenes, for two numbers where none is asked for."""
     for task in (FlatlandTask, MeshesTask):
         monkeypatch.setattr(task, "defaults", replace(task.defaults, rays=(8, 24)))
-    for module in ("rays.information", "rays.training", "rays.selection", "fitting.chosen", "fitting.trials"):
+    for module in ("rays.information", "rays.training_scenes", "rays.selection", "fitting.chosen", "fitting.trials"):
         monkeypatch.setattr(f"lidardesign.{module}.FEW_SCENES", 3)
 
 

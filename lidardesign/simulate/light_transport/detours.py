@@ -27,7 +27,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidardesign.numerics import COARSE_SLACK
+from lidardesign.numerics import COARSE_SLACK, safe_divide
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import Hits, Rays, in_view
 from lidardesign.scenes.scene import Scene
@@ -88,7 +88,8 @@ def lamp_bound(
     place = rays.origin_m[chosen] + hits.range_m[chosen, None] * rays.direction[chosen]
     start = _Ends(np.arange(len(chosen)), np.ones(len(chosen)), place, hits.normal[chosen], np.zeros(len(chosen)))
     direct_m = np.linalg.norm(lamp - place, axis=1)
-    own = np.maximum(np.einsum("kj,kj->k", start.normal, lamp - place), 0.0) / direct_m**3
+    # light that falls on a spot at the lamp itself is late by nothing
+    own = safe_divide(np.maximum(np.einsum("kj,kj->k", start.normal, lamp - place), 0.0), direct_m**3)
     first = _next(scene, caster, start, DIRECTIONS)
     second = _next(scene, caster, first, FURTHER_DIRECTIONS)
     # a flood's pixels see spots anywhere; a fixed receiver only those in its view
