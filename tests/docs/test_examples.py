@@ -18,7 +18,7 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 QUICK = ("learning.samples=10000", "learning.coverage_proposals=1024")
 # What is blurred is learned at once, and well enough on any processor: see `small_runs`.
 SETTINGS = {
-    "arm": (*QUICK, "learning.steps=80", "density.sigma_m=0.15", "train=6", "test=3", "frames=8"),
+    "arm": (*QUICK, "learning.steps=80", "density.sigma_m=0.15", "train=4", "test=2", "frames=6"),
     # a hundredth of the density lies where the flood may be: with few samples nothing could be fitted there
     "emitter": (
         "learning.samples=80000", QUICK[1], "learning.steps=80", "density.sigma_m=0.04",

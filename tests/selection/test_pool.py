@@ -27,8 +27,8 @@ from lidardesign.sensors.design_file import design_document
 @pytest.fixture(autouse=True, scope="module")
 def few_scenes():
     with pytest.MonkeyPatch.context() as patch:
-        for module in ("rays.information", "rays.training_scenes", "rays.selection", "fitting.chosen", "fitting.trials"):
-            patch.setattr(f"lidardesign.{module}.FEW_SCENES", 3)
+        for name in ("rays.information", "rays.training_scenes", "rays.selection", "fitting.chosen", "fitting.trials"):
+            patch.setattr(f"lidardesign.{name}.FEW_SCENES", 3)
         yield
 
 

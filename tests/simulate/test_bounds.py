@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import poisson
-from soak.promise import random_case
 from support.meshes import icosphere
 from support.planning import (
     CONSUMER,
@@ -26,6 +25,7 @@ from support.planning import (
 )
 from support.rays import rays_along
 
+from benchmarks.soak.promise import random_case
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.scene import (
     Ambient,
