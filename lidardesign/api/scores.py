@@ -197,9 +197,11 @@ class ScoreRequest:
             notes(note)
         baseline = options.fail_unless_better
         _check_baseline(baseline, [design.name for design in designs])
-        baselines = [*ALWAYS, *options.baselines, *([baseline] if baseline in BASELINES else [])]
-        if NONE in options.baselines:
-            baselines = []
+        baselines = (
+            []
+            if NONE in options.baselines
+            else [*ALWAYS, *options.baselines, *([baseline] if baseline in BASELINES else [])]
+        )
         rays = options.rays or usual_numbers([design.specification for design in designs], run.task.defaults.rays)
         if options.accuracy:
             # Refuse a run that is unfinished or damaged before it is evaluated, which may take minutes

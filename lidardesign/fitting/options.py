@@ -151,7 +151,7 @@ def check_goal(layout: LayoutName, constraints: Constraints, run: RunFolder, opt
     Raises:
         ConfigError: There is one.
     """
-    goal, least, metric, are_parts = options.goal, options.least, run.metric, constraints.parts is not None
+    goal, least, are_parts = options.goal, options.least, constraints.parts is not None
     faults = {
         ("no goal", "--least", "--goal SCORE --least WHAT"): goal is None and least is not None,
         ("a goal for sensors that spin", "--goal", "the layouts chosen and even"): (
@@ -168,7 +168,8 @@ def check_goal(layout: LayoutName, constraints: Constraints, run: RunFolder, opt
     }
     refuse_first(faults)
     if goal is not None:
-        low, high = metric.limits
+        # the metric of meshes is that of their size, which has to be read
+        metric, (low, high) = run.metric, run.metric.limits
         is_number = isinstance(goal, Real) and not isinstance(goal, bool)
         if not (is_number and math.isfinite(goal) and low <= goal <= high):
             allowed = f"a number from {low:g} to {high:g} {metric.unit}"
