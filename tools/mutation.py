@@ -31,12 +31,15 @@ from benchmarks.soak.long_runs import heading, kept, table, write_page  # noqa: 
 TESTS = {
     "lidardesign/numerics.py": ("test_numerics.py",),
     "lidardesign/mixture/components.py": ("design/test_mixture.py",),
-    "lidardesign/constraints/document.py": ("design/test_constraints.py", "design/test_check.py"),
+    "lidardesign/constraints/document.py": (
+        "design/test_constraints.py", "design/test_check.py", "design/test_hard_constraints.py",
+    ),
     "lidardesign/sensors/pattern.py": (
         "design/test_samplers.py", "design/test_pattern.py", "design/test_rays.py", "design/test_designs.py",
     ),
     "lidardesign/rays/choice.py": (
         "selection/test_choice.py", "selection/test_groups.py", "selection/test_certified.py",
+        "selection/test_selection.py", "selection/test_adaptive.py",
     ),
 }  # fmt: skip
 # Packages and modules that a mutant is to meet anew; the tests are too.
