@@ -100,7 +100,7 @@ coverage: $(BIN)/.dev
 		-m pytest -W ignore::RuntimeWarning tests/density/test_splines.py tests/density/test_frames.py \
 		tests/density/test_visibility.py tests/geometry/test_raycast.py tests/selection/test_groups.py
 	$(KERNELS) report --rcfile=/dev/null --data-file=build/kernels.coverage --include='*kernels.py'
-	$(BIN)/python -m coverage report --fail-under=90
+	$(BIN)/python -m coverage report --fail-under=95
 
 # Small changes of the core's code, and how many of them its tests notice: an hour
 mutation: $(BIN)/.dev
