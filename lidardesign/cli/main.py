@@ -200,8 +200,9 @@ def _invoke(arguments: list[str]) -> int:
         code: Any = app(arguments, prog_name=PROGRAM, standalone_mode=False)
     except typer.Exit as error:
         code = error.exit_code
-    except typer.Abort:
-        return report_error(KeyboardInterrupt(), output)
+    except (typer.Abort, KeyboardInterrupt) as error:
+        # a signal may come before any command has begun
+        return report_error(error if isinstance(error, KeyboardInterrupt) else KeyboardInterrupt(), output)
     except SystemExit as error:
         # typer ends like this once completion is shown or installed, rich where nobody reads any more
         if error.code:

@@ -16,9 +16,10 @@ from rich.console import Console
 import lidardesign as package
 from lidardesign import __version__
 from lidardesign.api.design import Design
+from lidardesign.cli.main import run as run_program
 from lidardesign.cli.terminal import output as console_module
 from lidardesign.cli.terminal.design_tables import show_fit
-from lidardesign.cli.terminal.output import command, plain_json
+from lidardesign.cli.terminal.output import TerminatedError, command, plain_json
 from lidardesign.errors import InfeasibleError
 from lidardesign.parts.catalogue import Pose, find_part, part_design
 from lidardesign.report.tables import sensors_table
@@ -205,3 +206,15 @@ def test_a_pinned_origin_is_weighted_with_the_visibility_that_the_run_decided_on
     target = RunTarget(open_run(flat))
     assert [target(np.zeros((3, 6))).shape for _ in range(2)] == [(3,), (3,)]
     assert asked == [(20, decided)]
+
+
+@pytest.mark.parametrize(("signal", "code"), [(KeyboardInterrupt, 130), (TerminatedError, 143)])
+def test_a_signal_before_any_command_has_begun_ends_with_its_code(monkeypatch, capsys, signal, code):
+    def interrupted(*_, **__):
+        raise signal
+
+    monkeypatch.setattr("lidardesign.cli.main.app", interrupted)
+    with pytest.raises(SystemExit) as ended:
+        run_program(["show", "run"])
+    assert ended.value.code == code
+    assert "Traceback" not in capsys.readouterr().err

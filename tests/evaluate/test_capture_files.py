@@ -205,6 +205,7 @@ def test_matlab_7_structures_and_foreign_hdf5_are_refused(tmp_path):
 
     for mode, change, message in (
         ("a", lambda file: file.create_group("scanner"), "'scanner' is a MATLAB structure"),
+        ("w", lambda file: file.create_dataset("start_ps", data=h5py.Empty("f8")), "start_ps"),
         ("w", lambda file: file.create_dataset("counts", data=np.ones((3, 3, 5))), "not written by MATLAB"),
         ("w", lambda file: file.update({"counts": h5py.ExternalLink("other.h5", "/counts")}), "link"),
         ("w", elsewhere, "another file"),

@@ -349,7 +349,8 @@ def _read_hdf5(path: Path) -> dict[str, np.ndarray]:
 def _check_dataset(name: str, dataset: Any, where: str) -> None:
     import h5py
 
-    if not isinstance(dataset, h5py.Dataset):
+    # without a shape a dataset is empty, as no array of MATLAB is
+    if not isinstance(dataset, h5py.Dataset) or dataset.shape is None:
         raise refused(name, "structure", where)
     if "MATLAB_class" not in dataset.attrs:
         raise DataError(
