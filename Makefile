@@ -5,13 +5,13 @@
 # make test-arithmetic  runs the commands of the docs with the arithmetic of a plain processor, two minutes
 # make test-pythons  installs and tests the core with every other Python that is found, four minutes each
 # make dist   builds sdist and wheel, installs the wheel with every Python that is found and runs the demo with it, ten minutes
-# make fuzz   reads 100,000 damaged files, an hour on two cores; the result goes to docs/soak
+# make fuzz   reads 100,000 damaged files, some ten minutes; the result goes to docs/soak
 # make coverage  measures the lines and branches that the tests take, an hour
 # make mutation  changes the core's code in a thousand small ways and counts what its tests notice; to docs/soak
 # make soak   all long runs, a night on two cores: random whole runs, many seeds, kills, then fuzz and mutation; each
 #             also alone, as make soak-runs, soak-seeds and soak-kills; dated results go to docs/soak; with AMOUNT=N
 #             fuzz, mutation (of each module) and each of these do N inputs, mutants, runs, seeds, kills or plans
-# make soak-promise  makes 2,000 random plans of effects and looks whether they keep what they promise, ten minutes
+# make soak-promise  makes 2,000 random plans of effects and looks whether they keep what they promise, a minute or two
 #             what is interrupted (also fuzz, mutation and coverage) goes on when it is started again at the same commit
 # make clean  takes all of it away again
 PYTHON ?= python3

@@ -119,9 +119,9 @@ def pytest_terminal_summary(terminalreporter, config):
         if report.failed
         for fault in (dict(report.user_properties).get("piece") or {"faults": [str(report.longrepr)[-300:]]})["faults"]
     ]
-    minutes = sum(one["wall_s"] for one in pieces) / 60
+    seconds = sum(one["wall_s"] for one in pieces)
     command = f"pytest {' '.join(config.args)} --amount {config.getoption('amount')}"
-    said = [heading(title.rstrip("."), command), f"{minutes:.0f} minutes of one process.", about.strip()]
+    said = [heading(title.rstrip("."), command), f"{seconds:.0f} s of one process.", about.strip()]
     page = folder / f"{path.stem}-{datetime.datetime.now(datetime.UTC).date()}.md"
     write_page(page, [*said, *_tables(pieces), "## Faults", "\n".join(faults) or "None."])
     terminalreporter.write_line(f"{page}: {len(faults)} faults")

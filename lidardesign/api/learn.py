@@ -93,7 +93,7 @@ class LearnOptions:
             check_number(self.tolerance, "--tolerance", *TOLERANCES)
             said = [text for text in settings_texts(self.settings) if text.startswith("learning.misplaced=")]
             if said:
-                raise ConfigError(f"beside --set {said[0]}", where="--tolerance", allowed="one of the two")
+                raise ConfigError(f"is given beside --set {said[0]}", where="--tolerance", allowed="one of the two")
         if self.time_budget_s is not None:
             check_number(self.time_budget_s, "--time-budget", *TIME_BUDGETS_S)
 

@@ -97,7 +97,7 @@ class ScoreOptions:
         if NONE in self.baselines:
             if len(self.baselines) > 1 or self.fail_unless_better in BASELINES:
                 raise ConfigError(
-                    "none together with another baseline, of this or of --fail-unless-better",
+                    "none beside a baseline that this or --fail-unless-better names",
                     where="--baseline",
                     allowed="none alone",
                 )

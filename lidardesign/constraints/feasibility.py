@@ -111,14 +111,14 @@ def unit_notes(constraints: Constraints, space: DesignSpace) -> list[str]:
     far = {name: value for name, value in given.items() if "_m." in f"{name}." and abs(value) > most_m}
     narrow = {name: value for name, value in given.items() if "field_of_view" in name and 0 < value < DOUBTFUL_DEG}
     # whoever means degrees writes few digits
-    odd = {
+    unrounded = {
         name: value
         for name, value in given.items()
         if "boresight" in name and abs(value) <= math.tau and not (2 * value).is_integer()
     }
     return [
         *(f"{name}={value:g} is far beyond the design space: in millimetres?" for name, value in far.items()),
-        *(f"{name}={value:g} is a very small angle: in radians?" for name, value in {**narrow, **odd}.items()),
+        *(f"{name}={value:g} is a very small angle: in radians?" for name, value in {**narrow, **unrounded}.items()),
     ]
 
 

@@ -135,7 +135,7 @@ def check_layout(layout: LayoutName, constraints: Constraints, run: RunFolder, o
         (f"patterns that follow what they see in {place}", "--adaptive", "--layout chosen, without parts"): (
             (options.adaptive or 1) > 1 and place != "the layout chosen"
         ),
-        ("patterns that follow what they see, of sensors that survive", "--adaptive", "one of the two"): (
+        ("patterns that follow what they see, together with survive", "--adaptive", "one of the two"): (
             (options.adaptive or 1) > 1 and bool(constraints.survive)
         ),
         (f"{options.sensors!r} sensors in the layout spinning", "--sensors", "a whole number"): (

@@ -208,7 +208,7 @@ def test_bounds_that_are_probably_in_another_unit_are_questioned(override, quest
     assert all(re.search(question, note) for note in notes)
 
 
-def test_what_a_file_leaves_out_is_what_the_documentation_says():
+def test_what_a_file_leaves_out_has_its_usual_value():
     left_out = Constraints()
     assert (left_out.budget.bin_ps, left_out.budget.bits_per_bin, left_out.budget.rate_hz) == (100, 40, 10)
     assert (left_out.survive, left_out.least_sensors) == (0, 1)
