@@ -7,6 +7,7 @@ import json
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -66,7 +67,7 @@ class RunFolder:
         """Path of a design file of this run."""
         return self.folder / DESIGN_FOLDER / f"{name}.yaml"
 
-    @property
+    @cached_property
     def metric(self) -> Metric:
         """Metric of the task's scores with the run's configuration."""
         with plugin_guard(self.task.name):

@@ -74,8 +74,7 @@ class TrainingScores:
         """The mean of the scores of a design less those of another, scene by scene, with its interval."""
         from lidardesign.estimates import paired_difference
 
-        limits = self.run.metric.limits
-        return paired_difference(self.values(design), self.values(other), self._groups, limits=limits)
+        return paired_difference(self.values(design), self.values(other), self._groups, limits=self.run.metric.limits)
 
     @cached_property
     def _groups(self) -> np.ndarray:
