@@ -35,12 +35,15 @@ def test_a_fixed_angle_admits_no_field_of_view_along_it():
         ({"gate": {"width_m": {"max": -1}}}, "greater than or equal to 0.000000001"),
         ({"gate": 3}, "gate"),
         ({"gate": {"end_m": {"max": math.inf}}}, "a finite number"),
+        *[({"sensors": {"count": 2, other: 2}}, "either count, or min and max") for other in ("min", "max")],
+        *[(values, f"found one {type(values).__name__}") for values in ([], "gate", 3, False, ())],
     ],
 )
-def test_what_a_file_may_not_say_is_a_config_error_with_its_key(values, text):
+def test_what_a_file_may_not_say_is_a_config_error_with_its_key_and_place(values, text):
     with pytest.raises(ConfigError, match=text) as caught:
-        Constraints.from_mapping(values)
+        Constraints.from_mapping(values, where="--constraints")
     assert caught.value.exit_code == 2
+    assert "--constraints" in str(caught.value)
 
 
 BOX = {"low_m": [0, 0, 0], "high_m": [1, 1, 1]}
@@ -106,25 +109,6 @@ def test_an_excluded_box_is_given_from_low_to_high_and_may_be_flat(axis):
         Constraints.from_mapping({"origin": {"exclude": [{"low_m": low, "high_m": high}]}})
 
 
-@pytest.mark.parametrize("other", ["min", "max"])
-def test_a_number_of_sensors_is_given_in_one_form(other):
-    with pytest.raises(ConfigError, match="either count, or min and max"):
-        Constraints.from_mapping({"sensors": {"count": 2, other: 2}})
-    assert Constraints.from_mapping({"sensors": {"min": 2, "max": 2}}).sensors.count is None
-
-
-@pytest.mark.parametrize("values", [[], "gate", 3, False, ()])
-def test_what_is_no_mapping_is_named(values):
-    with pytest.raises(ConfigError, match=f"found one {type(values).__name__}"):
-        Constraints.from_mapping(values)
-
-
-def test_the_place_of_an_error_without_a_file_is_what_the_caller_says():
-    with pytest.raises(ConfigError) as caught:
-        Constraints.from_mapping({"gates": {}}, where="--constraints")
-    assert "--constraints" in str(caught.value)
-
-
 def test_entries_of_each_lie_over_the_common_keys():
     values = {"gate": {"width_m": {"min": 0.1, "max": 0.5}}, "each": [{}, {"gate": {"width_m": {"max": 0.2}}}]}
     constraints = Constraints.from_mapping(values)
@@ -171,18 +155,6 @@ def test_what_follows_from_keys_and_from_those_left_out(values, name, value):
     assert attrgetter(name)(Constraints.from_mapping(values)) == value
 
 
-# --- files and options
-
-
-def test_constraints_are_given_as_values_as_a_file_or_not_at_all(tmp_path):
-    path, read = tmp_path / "rules.yaml", Constraints.from_mapping({"gate": {"width_m": {"max": 0.5}}})
-    path.write_text("gate: {width_m: {max: 0.5}}")
-    assert load_constraints(read) is read
-    assert load_constraints(None) is None
-    given = (read.as_document(), path, str(path))
-    assert [load_constraints(one).as_document() for one in given] == [read.as_document()] * 3
-
-
 @pytest.mark.parametrize(
     ("text", "overrides", "where"),
     [
@@ -203,15 +175,18 @@ def test_an_error_is_placed_where_its_value_was_given(tmp_path, text, overrides,
 
 
 @pytest.mark.parametrize(
-    ("text", "notes"), [("", 1), ("gate: {}", 1), ("each: []", 1), ("survive: 0", 0), ("each: [{}]\nsurvive: 0", 0)]
+    ("text", "notes"), [("", 1), ("gate: {}", 1), ("each: []", 1), ("survive: 0", 0), ("gate: {end_m: {max: 2}}", 0)]
 )
-def test_a_file_that_says_nothing_is_noted(tmp_path, text, notes):
+def test_constraints_are_given_as_a_file_that_may_say_nothing_as_values_or_not_at_all(tmp_path, text, notes):
     path, found = tmp_path / "rules.yaml", []
     path.write_text(text)
-    load_constraints(path, notes=found.append)
+    read = load_constraints(path, notes=found.append)
+    assert load_constraints(read) is read
+    for one in (read.as_document(), str(path)):
+        assert load_constraints(one).as_document() == read.as_document()
+    assert load_constraints(None) is None
+    assert load_constraints(None, ["gate={}"], found.append).as_document() == {"gate": {}}
     assert found == [f"{path} holds no constraints"] * notes
-    load_constraints(None, ["gate={}"], found.append)
-    assert len(found) == notes
 
 
 def test_settings_of_a_task_are_told_from_constraints_by_their_first_key():
