@@ -154,12 +154,13 @@ def test_beyond_the_first_and_last_list_rays_stay_as_they_are_there(ends, furthe
         np.testing.assert_array_equal(there.gate_m, here.gate_m)
 
 
-def test_rays_pass_through_south_without_a_jump():
-    lists = [fan(x, turn=math.pi - 0.05) for x in KNOTS]
+@pytest.mark.parametrize("turn", [-0.05, math.pi - 0.05])
+def test_rays_pass_through_north_and_south_without_a_jump(turn):
+    lists = [fan(x, turn) for x in KNOTS]
     wrapped = [Rays.from_angles(one.origin_m, *angles(one.direction), one.gate_m, one.sensor) for one in lists]
     pattern = Pattern.along("x_m", KNOTS, wrapped, ENDS)
     assert np.abs(np.diff(pattern.azimuth_rad, axis=0)).max() < 0.2
-    np.testing.assert_allclose(pattern.at(0.8).direction, fan(0.8, turn=math.pi - 0.05).direction, atol=1e-3)
+    np.testing.assert_allclose(pattern.at(0.8).direction, fan(0.8, turn).direction, atol=1e-3)
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.4, -2.0])
