@@ -22,8 +22,8 @@ from lidardesign.space import DIMENSIONS, angles, direction
 
 # Conditions that a sensor can travel along: where a ray starts, not where it looks.
 TRAVELLED = DIMENSIONS[:3]
-# Of low-discrepancy points: so many axes have an additive recurrence.
-RECURRENCE_AXES = 2
+# Of low-discrepancy points on one and two axes: the golden ratio and the plastic number.
+ROOTS = (1.618033988749895, 1.324717957244746)
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,8 +184,7 @@ def field_on_sphere(sensor: Sensor) -> tuple[float, float]:
     Past the angle pi the tangent plane covers the sphere a second time, so rays there would point elsewhere.
     """
     horizontal, vertical = sensor.field_of_view_rad
-    corner = math.hypot(horizontal, vertical) / 2
-    scale = math.pi / corner if corner > math.pi else 1.0
+    scale = math.pi / max(math.hypot(horizontal, vertical) / 2, math.pi)
     return scale * horizontal, scale * vertical
 
 
@@ -212,11 +211,9 @@ def grid_rows(horizontal_rad: float, vertical_rad: float, count: int) -> np.ndar
 
 
 def _row_count(horizontal_rad: float, vertical_rad: float, count: int) -> int:
-    """The number of rows whose cells are closest to square by ratio; a field without height is one row."""
-    if vertical_rad <= 0:
-        return 1
+    """The number of rows whose cells are closest to square by ratio; 0 for a field without height."""
     if horizontal_rad <= 0:
-        return count
+        return count * (vertical_rad > 0)
     ideal = min(count, math.sqrt(count * (vertical_rad / horizontal_rad)))
     fewer = math.floor(ideal)
     return fewer if ideal**2 <= fewer * (fewer + 1) else fewer + 1
@@ -231,15 +228,12 @@ def low_discrepancy(count: int, axes: int) -> np.ndarray:
     of 100 cells of their square empty); there J. Halton's sequence (1960) in the first primes. The smallest ones are
     the most even: they go to the last axes, which are those of directions.
     """
-    if axes > RECURRENCE_AXES:
+    if axes > len(ROOTS):
         # slow to import
         from scipy.stats.qmc import Halton
 
         return Halton(axes, scramble=False).fast_forward(1).random(count)[:, ::-1]
-    phi = 1.5
-    for _ in range(64):  # a contraction by at least 3: 64 steps are far below rounding
-        phi = (1.0 + phi) ** (1.0 / (axes + 1))
-    generators = phi ** -np.arange(1.0, axes + 1)
+    generators = ROOTS[axes - 1] ** -np.arange(1.0, axes + 1)
     return np.mod(0.5 + np.arange(1, count + 1)[:, None] * generators, 1.0)
 
 
