@@ -206,8 +206,8 @@ def grid_rows(horizontal_rad: float, vertical_rad: float, count: int) -> np.ndar
     evenly as possible, so a budget of k * k in a square field is the regular k by k grid.
     """
     rows = max(_row_count(horizontal_rad, vertical_rad, count), 1)
-    # floor((2 i n + rows) / (2 rows)) rounds i n / rows half up in whole numbers, without a rounding error
-    return np.diff((2 * np.arange(rows + 1, dtype=np.int64) * count + rows) // (2 * rows))
+    # i n / rows rounded half up in whole numbers, without a rounding error
+    return np.diff((np.arange(rows + 1, dtype=np.int64) * count + rows // 2) // rows)
 
 
 def _row_count(horizontal_rad: float, vertical_rad: float, count: int) -> int:
