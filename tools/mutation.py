@@ -35,7 +35,7 @@ TESTS = {
         "design/test_constraints.py", "design/test_check.py", "design/test_hard_constraints.py",
     ),
     "lidardesign/sensors/pattern.py": (
-        "design/test_samplers.py", "design/test_pattern.py", "design/test_rays.py", "design/test_designs.py",
+        "design/test_pattern.py", "design/test_rays.py", "design/test_designs.py", "design/test_samplers.py",
     ),
     "lidardesign/rays/choice.py": (
         "selection/test_choice.py", "selection/test_groups.py", "selection/test_certified.py",

@@ -23,6 +23,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import accumulate
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -236,7 +237,7 @@ class SensorConstraints(_Keys):
     gate: Gate = Gate()
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class SensorRules:
     """The rules of one sensor: the common keys overridden by its entry of `each`.
 
@@ -319,14 +320,13 @@ class Constraints(SensorConstraints):
     @cached_property
     def rules(self) -> tuple[SensorRules, ...]:
         """The rules of the sensor of each entry of `each`, and last those of every further sensor."""
-        common = self.model_dump(exclude_none=True, include=set(SensorConstraints.model_fields))
+        common = self.model_dump(include=set(SensorConstraints.model_fields))
         rules = []
         for index, entry in enumerate([*self.each, SensorConstraints()]):
-            own = entry.model_dump(exclude_none=True)
+            own = entry.model_dump(exclude_defaults=True)
             resolved = SensorConstraints.model_validate(merged(common, own))
             # the keys at every depth, joined by dots
-            paths = [list(map(str, path)) for path, _ in leaves(own)]
-            keys = {".".join(path[:depth]) for path in paths for depth in range(1, len(path) + 1)}
+            keys = {key for path, _ in leaves(own) for key in accumulate(map(str, path), "{}.{}".format)}
             rules.append(SensorRules(**dict(resolved), index=index, own_keys=frozenset(keys)))
         return tuple(rules)
 
@@ -363,9 +363,8 @@ def load_constraints(
         origins[apply_override(values, override)] = override.where
 
     def locate(path: KeyPath, *, key: bool = False) -> str:
-        path = tuple(path)
         for origin, where in origins.items():
-            if path[: len(origin)] == origin or origin[: len(path)] == path != ():
+            if path[: len(origin)] == origin or origin[: len(path)] == path:
                 return where
         return document.locate(path, key=key)
 

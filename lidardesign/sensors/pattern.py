@@ -22,8 +22,8 @@ from lidardesign.space import DIMENSIONS, angles, direction
 
 # Conditions that a sensor can travel along: where a ray starts, not where it looks.
 TRAVELLED = DIMENSIONS[:3]
-# Of low-discrepancy points: so many axes have an additive recurrence.
-RECURRENCE_AXES = 2
+# Of low-discrepancy points on one and two axes: the golden ratio and the plastic number.
+ROOTS = (1.618033988749895, 1.324717957244746)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,18 +68,16 @@ class Pattern:
         # slow to import
         from scipy.optimize import linear_sum_assignment
 
-        order = np.argsort(knots)
-        rays = [lists[order[0]]]
-        for place in order[1:]:
-            aims = [one.direction * one.gate_m.mean(axis=1, keepdims=True) for one in (rays[-1], lists[place])]
-            before, after = rays[-1].sensor, lists[place].sensor
-            taken = np.empty(len(before), dtype=np.intp)
-            for sensor in np.unique(before):
-                mine, theirs = np.flatnonzero(before == sensor), np.flatnonzero(after == sensor)
-                moves = np.square(aims[0][mine][:, None] - aims[1][theirs][None]).sum(axis=2)
+        first, *others = (lists[place] for place in np.argsort(knots))
+        rays, places = [first], sorted(map(float, knots))
+        for other in others:
+            here, there = (one.direction * one.gate_m.mean(axis=1, keepdims=True) for one in (rays[-1], other))
+            taken = np.empty(len(first), dtype=np.intp)
+            for sensor in np.unique(first.sensor):
+                mine, theirs = np.flatnonzero(first.sensor == sensor), np.flatnonzero(other.sensor == sensor)
+                moves = np.square(here[mine][:, None] - there[theirs]).sum(axis=2)
                 taken[mine] = theirs[linear_sum_assignment(moves)[1]]
-            rays.append(lists[place].subset(taken))
-        places = np.array(knots, dtype=np.float64)[order].tolist()
+            rays.append(other.subset(taken))
         if ends[0] < places[0]:
             places, rays = [float(ends[0]), *places], [rays[0], *rays]
         if ends[1] > places[-1]:
@@ -91,7 +89,7 @@ class Pattern:
             np.unwrap(np.stack([one.azimuth_rad for one in rays]), axis=0),
             np.stack([one.elevation_rad for one in rays]),
             np.stack([one.gate_m for one in rays]),
-            rays[0].sensor,
+            first.sensor,
             dimension,
             tuple(places),
         )
@@ -121,10 +119,9 @@ class Pattern:
         Raises:
             ConfigError: The pattern has a condition and no value is given, or one beyond its ends.
         """
+        columns = (self.origin_m, self.azimuth_rad, self.elevation_rad, self.gate_m)
         if self.dimension is None:
-            return Rays.from_angles(
-                self.origin_m[0], self.azimuth_rad[0], self.elevation_rad[0], self.gate_m[0], self.sensor
-            )
+            return Rays.from_angles(*(only for (only,) in columns), self.sensor)
         first, last = self.ends
         if value is None:
             middle = (first + last) / 2
@@ -134,15 +131,14 @@ class Pattern:
                 allowed=f"{self.dimension} from {first:g} to {last:g}",
                 hint=f"give --at {self.dimension}={middle:g}",
             )
-        if not (math.isfinite(value) and first <= value <= last):
+        if not first <= value <= last:
             raise ConfigError(
                 f"{self.dimension}={value:g} is beyond the ends of the pattern",
                 where="--at",
                 allowed=f"{first:g} to {last:g}",
             )
-        right = int(np.clip(np.searchsorted(self.knots, value), 1, len(self.knots) - 1))
+        right = int(np.searchsorted(self.knots[1:], value)) + 1
         share = (value - self.knots[right - 1]) / (self.knots[right] - self.knots[right - 1])
-        columns = (self.origin_m, self.azimuth_rad, self.elevation_rad, self.gate_m)
         origin_m, *rest = ((1 - share) * column[right - 1] + share * column[right] for column in columns)
         origin_m[:, DIMENSIONS.index(self.dimension)] = value
         return Rays.from_angles(origin_m, *rest, self.sensor)
@@ -157,8 +153,7 @@ class Pattern:
         origin_m, looking = self.origin_m.copy(), direction(self.azimuth_rad, self.elevation_rad)
         origin_m[:, own] = (origin_m[:, own] - before[:, None]) @ turn.T + after[:, None]
         azimuth, elevation = self.azimuth_rad.copy(), self.elevation_rad.copy()
-        found = angles((looking[:, own] @ turn.T).reshape(-1, 3))
-        azimuth[:, own], elevation[:, own] = (one.reshape(places, -1) for one in found)
+        azimuth[:, own], elevation[:, own] = angles(looking[:, own] @ turn.T)
         return replace(self, origin_m=origin_m, azimuth_rad=np.unwrap(azimuth, axis=0), elevation_rad=elevation)
 
 
@@ -172,9 +167,11 @@ def with_coordinates(origin_m: np.ndarray, values: Mapping[int, float]) -> np.nd
 
 def even_rays(sensors: Sequence[Sensor], counts: Sequence[int]) -> Rays:
     """An even grid of rays in each sensor's field of view, `counts` of each, with its gate and origin."""
-    tangents = [grid_tangent(*field_on_sphere(one), int(n)) for one, n in zip(sensors, counts, strict=True)]
     sensor = np.repeat(np.arange(len(sensors)), counts)
-    looking = [tangent_directions(one.frame, tangent) for one, tangent in zip(sensors, tangents, strict=True)]
+    looking = [
+        tangent_directions(one.frame, grid_tangent(*field_on_sphere(one), int(n)))
+        for one, n in zip(sensors, counts, strict=True)
+    ]
     origin_m = np.array([one.origin_m for one in sensors], dtype=np.float64)[sensor]
     gate_m = np.array([one.gate_m for one in sensors], dtype=np.float64)[sensor]
     times = fire_times(len(sensor), DEFAULT_RATE_HZ)
@@ -187,8 +184,7 @@ def field_on_sphere(sensor: Sensor) -> tuple[float, float]:
     Past the angle pi the tangent plane covers the sphere a second time, so rays there would point elsewhere.
     """
     horizontal, vertical = sensor.field_of_view_rad
-    corner = math.hypot(horizontal, vertical) / 2
-    scale = math.pi / corner if corner > math.pi else 1.0
+    scale = math.pi / max(math.hypot(horizontal, vertical) / 2, math.pi)
     return scale * horizontal, scale * vertical
 
 
@@ -198,37 +194,29 @@ def grid_tangent(horizontal_rad: float, vertical_rad: float, count: int) -> np.n
     Cell-centred: ray i of n in a row stands at -FoV/2 + FoV * (i + 1/2) / n, never on the field's edge.
     """
     rows = grid_rows(horizontal_rad, vertical_rad, count)
-    if not rows.size:
-        return np.zeros((0, 2))
     across = np.concatenate([(np.arange(n) + 0.5) / n - 0.5 for n in rows])
     up = np.repeat((np.arange(len(rows)) + 0.5) / len(rows) - 0.5, rows)
     return np.stack([horizontal_rad * across, vertical_rad * up], axis=1)
 
 
 def grid_rows(horizontal_rad: float, vertical_rad: float, count: int) -> np.ndarray:
-    """Rays per row of an even grid, int64 (rows,), summing to `count`.
+    """Rays per row of an even grid, int64 (rows,), summing to `count`; no rays are one row of none.
 
     The number of rows makes the cells as square as whole numbers allow; the rays are spread over the rows as
     evenly as possible, so a budget of k * k in a square field is the regular k by k grid.
     """
-    if count == 0:
-        return np.zeros(0, dtype=np.int64)
-    rows = _row_count(horizontal_rad, vertical_rad, count)
-    # floor((2 i n + rows) / (2 rows)) rounds i n / rows half up in whole numbers, without a rounding error
-    return np.diff((2 * np.arange(rows + 1, dtype=np.int64) * count + rows) // (2 * rows))
+    rows = max(_row_count(horizontal_rad, vertical_rad, count), 1)
+    # i n / rows rounded half up in whole numbers, without a rounding error
+    return np.diff((np.arange(rows + 1, dtype=np.int64) * count + rows // 2) // rows)
 
 
 def _row_count(horizontal_rad: float, vertical_rad: float, count: int) -> int:
-    """The number of rows whose cells are closest to square by ratio; a field without height is one row."""
-    if vertical_rad <= 0:
-        return 1
+    """The number of rows whose cells are closest to square by ratio; 0 for a field without height."""
     if horizontal_rad <= 0:
-        return count
-    ideal = math.sqrt(count * (vertical_rad / horizontal_rad))
-    if ideal >= count:
-        return count
-    fewer = max(math.floor(ideal), 1)
-    return fewer if ideal**2 <= fewer * (fewer + 1) else min(fewer + 1, count)
+        return count * (vertical_rad > 0)
+    ideal = min(count, math.sqrt(count * (vertical_rad / horizontal_rad)))
+    fewer = math.floor(ideal)
+    return fewer if ideal**2 <= fewer * (fewer + 1) else fewer + 1
 
 
 def low_discrepancy(count: int, axes: int) -> np.ndarray:
@@ -240,15 +228,12 @@ def low_discrepancy(count: int, axes: int) -> np.ndarray:
     of 100 cells of their square empty); there J. Halton's sequence (1960) in the first primes. The smallest ones are
     the most even: they go to the last axes, which are those of directions.
     """
-    if axes > RECURRENCE_AXES:
+    if axes > len(ROOTS):
         # slow to import
         from scipy.stats.qmc import Halton
 
         return Halton(axes, scramble=False).fast_forward(1).random(count)[:, ::-1]
-    phi = 1.5
-    for _ in range(64):  # a contraction by at least 3: 64 steps are far below rounding
-        phi = (1.0 + phi) ** (1.0 / (axes + 1))
-    generators = phi ** -np.arange(1.0, axes + 1)
+    generators = ROOTS[axes - 1] ** -np.arange(1.0, axes + 1)
     return np.mod(0.5 + np.arange(1, count + 1)[:, None] * generators, 1.0)
 
 
@@ -272,6 +257,6 @@ def even_subset(points: np.ndarray, count: int) -> np.ndarray:
         axis = np.round(np.ptp(inside, axis=0), 9).argmax()
         order = members[np.argsort(np.round(inside[:, axis], 9), kind="stable")]
         first = wanted // 2
-        cut = int(np.clip(round(len(order) * first / wanted), first, len(order) - (wanted - first)))
+        cut = round(len(order) * first / wanted)
         groups += [(order[:cut], first), (order[cut:], wanted - first)]
     return np.sort(np.array(kept, dtype=np.int64))

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 import re
+from operator import attrgetter
+from types import SimpleNamespace
 
 import pytest
 from support.constraints import FACE
 
-from lidardesign.constraints.document import Constraints, DistanceRange, Gate, load_constraints, rules_of
+from lidardesign.constraints.document import Constraints, Gate, load_constraints, rules_of, split_settings
 from lidardesign.constraints.feasibility import check_feasible, unit_notes
 from lidardesign.errors import ConfigError, InfeasibleError
+from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.sensor import MOST_RAYS
 from lidardesign.space import DesignSpace
 
@@ -31,12 +34,16 @@ def test_a_fixed_angle_admits_no_field_of_view_along_it():
         ({"origin": {"thickness_m": {"max": 0}}}, "origin.thickness_m.max"),
         ({"gate": {"width_m": {"max": -1}}}, "greater than or equal to 0.000000001"),
         ({"gate": 3}, "gate"),
+        ({"gate": {"end_m": {"max": math.inf}}}, "a finite number"),
+        *[({"sensors": {"count": 2, other: 2}}, "either count, or min and max") for other in ("min", "max")],
+        *[(values, f"found one {type(values).__name__}") for values in ([], "gate", 3, False, ())],
     ],
 )
-def test_what_a_file_may_not_say_is_a_config_error_with_its_key(values, text):
+def test_what_a_file_may_not_say_is_a_config_error_with_its_key_and_place(values, text):
     with pytest.raises(ConfigError, match=text) as caught:
-        Constraints.from_mapping(values)
+        Constraints.from_mapping(values, where="--constraints")
     assert caught.value.exit_code == 2
+    assert "--constraints" in str(caught.value)
 
 
 BOX = {"low_m": [0, 0, 0], "high_m": [1, 1, 1]}
@@ -67,6 +74,7 @@ LIMITS = {
     "origin.mounts_m": ([[[0, 0, 0]], [[0, 0, 0], [0, 0, 1]]], [[], [[0, 0]]]),
     "parts.price.max": ([0.5, 40, 1e9], [0, -1, "40"]),
     "parts.names": ([["a"], ["a", "b"], "catalog"], [[], [""], "a"]),
+    "survive": ([0, 1], [-1, 2, 0.5, True]),
     "origin.exclude": ([[], [BOX] * 32], [[BOX] * 33, [{"low_m": [0, 0, 0]}]]),
 }
 
@@ -101,33 +109,6 @@ def test_an_excluded_box_is_given_from_low_to_high_and_may_be_flat(axis):
         Constraints.from_mapping({"origin": {"exclude": [{"low_m": low, "high_m": high}]}})
 
 
-@pytest.mark.parametrize("other", ["min", "max"])
-def test_a_number_of_sensors_is_given_in_one_form(other):
-    with pytest.raises(ConfigError, match="either count, or min and max"):
-        Constraints.from_mapping({"sensors": {"count": 2, other: 2}})
-    assert Constraints.from_mapping({"sensors": {"min": 2, "max": 2}}).sensors.count is None
-
-
-@pytest.mark.parametrize("values", [[], "gate", 3, False, ()])
-def test_what_is_no_mapping_is_named(values):
-    with pytest.raises(ConfigError, match=f"found one {type(values).__name__}"):
-        Constraints.from_mapping(values)
-
-
-def test_the_place_of_an_error_without_a_file_is_what_the_caller_says():
-    with pytest.raises(ConfigError) as caught:
-        Constraints.from_mapping({"gates": {}}, where="--constraints")
-    assert "--constraints" in str(caught.value)
-
-
-def test_positions_of_errors_come_from_the_file():
-    def locate(path, *, key=False):
-        return f"c.yaml:{len(path)}:{int(key)}"
-
-    with pytest.raises(ConfigError, match=r"c\.yaml:2:1"):
-        Constraints.from_mapping({"gate": {"width": 1}}, locate=locate)
-
-
 def test_entries_of_each_lie_over_the_common_keys():
     values = {"gate": {"width_m": {"min": 0.1, "max": 0.5}}, "each": [{}, {"gate": {"width_m": {"max": 0.2}}}]}
     constraints = Constraints.from_mapping(values)
@@ -140,15 +121,78 @@ def test_an_entry_of_each_is_named_where_a_key_stands_in_it():
     values = {"gate": {"width_m": {"min": 0.1}}, "each": [{"gate": {"width_m": {"max": 0.2}}}, {}]}
     first, *others = (rules_of(Constraints.from_mapping(values).rules, sensor) for sensor in range(3))
     assert first.path("gate.width_m.max") == "each[0].gate.width_m.max"
-    for key in ("gate.width_m.min", "gate.width_m.max.deeper"):
+    assert first.path("gate") == "each[0].gate"
+    for key in ("gate.width_m.min", "gate.width_m.max.deeper", "origin", "boresight.roll_deg"):
         assert first.path(key) == key
-    assert {one.path("gate.width_m.max") for one in others} == {"gate.width_m.max"}
+    for key in ("gate.width_m.max", "gate", "origin"):
+        assert {one.path(key) for one in others} == {key}
 
 
 def test_a_document_holds_what_was_given_and_no_more():
-    width = DistanceRange(min=None, max=0.5)
-    assert Constraints(gate=Gate(width_m=width)).as_document() == {"gate": {"width_m": {"max": 0.5}}}
-    assert Constraints().as_document() == {}
+    gate = Gate(width_m={"min": None, "max": 0.5})
+    assert Constraints(gate=gate).as_document() == {"gate": {"width_m": {"max": 0.5}}}
+    assert [Constraints(survive=number).as_document() for number in (0, 1)] == [{}, {"survive": 1}]
+
+
+@pytest.mark.parametrize("part", [lambda read: read, lambda read: read.gate, lambda read: read.rules[0]])
+def test_what_was_read_stays_as_it_is(part):
+    with pytest.raises((ValueError, AttributeError), match=r"frozen|cannot assign"):
+        part(Constraints()).gate = Gate()
+
+
+@pytest.mark.parametrize(
+    ("values", "name", "value"),
+    [
+        *[({}, "survive", 0), ({}, "budget.readout", Bandwidth(100, 40, 10))],
+        *[({}, "least_sensors", 1), ({"survive": 1}, "least_sensors", 2), ({"each": [{}] * 3}, "least_sensors", 3)],
+        *[({"sensors": {"min": number}, "survive": 1}, "least_sensors", max(number, 2)) for number in (1, 2, 3)],
+        ({"parts": {}}, "parts.sums", {}),
+        ({"parts": {"power_w": 2}}, "parts.sums", {"parts.power_w": ("power_w", 2)}),
+        ({"parts": {"price": {"max": 40}}}, "parts.sums", {"parts.price.max": ("price", 40)}),
+    ],
+)
+def test_what_follows_from_keys_and_from_those_left_out(values, name, value):
+    assert attrgetter(name)(Constraints.from_mapping(values)) == value
+
+
+@pytest.mark.parametrize(
+    ("text", "overrides", "where"),
+    [
+        # of the file: its line and column, whatever options say of other keys
+        *[("budget:\n  rays: 0", options, r"yaml:2:9\b") for options in ((), ["survive=1"], ["budget.bin_ps=1"])],
+        *[("gate: {end_m: null}", (), r"yaml:1:15\b"), ("gate: {end: 1}", (), r"yaml:1:8\b")],
+        # of an option: the error may be at its key, in its value, or where the file and it contradict each other
+        ("budget: {rays: 0}", ["budget.rays=-1"], r"--set budget\.rays=-1"),
+        ("", ["survive=1", "budget={rays: 0}"], r"--set budget=\{rays: 0\}"),
+        ("sensors: {count: 2}", ["survive=1", "sensors.min=1"], r"--set sensors\.min=1"),
+    ],
+)
+def test_an_error_is_placed_where_its_value_was_given(tmp_path, text, overrides, where):
+    path = tmp_path / "rules.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=where):
+        load_constraints(path, overrides)
+
+
+@pytest.mark.parametrize(
+    ("text", "notes"), [("", 1), ("gate: {}", 1), ("each: []", 1), ("survive: 0", 0), ("gate: {end_m: {max: 2}}", 0)]
+)
+def test_constraints_are_given_as_a_file_that_may_say_nothing_as_values_or_not_at_all(tmp_path, text, notes):
+    path, found = tmp_path / "rules.yaml", []
+    path.write_text(text)
+    read = load_constraints(path, notes=found.append)
+    assert load_constraints(read) is read
+    for one in (read.as_document(), str(path)):
+        assert load_constraints(one).as_document() == read.as_document()
+    assert load_constraints(None) is None
+    assert load_constraints(None, ["gate={}"], found.append).as_document() == {"gate": {}}
+    assert found == [f"{path} holds no constraints"] * notes
+
+
+def test_settings_of_a_task_are_told_from_constraints_by_their_first_key():
+    task = SimpleNamespace(Config=SimpleNamespace(model_fields={"depth": None, "gate": None}))
+    bounds, settings = ["gate.end_m.max=1", "budget.depth=1", "unknown=1"], ["depth.gate=1", "depth=2"]
+    assert split_settings([*settings, *bounds], task) == (bounds, settings)
 
 
 @pytest.mark.parametrize(
@@ -171,8 +215,9 @@ def test_a_key_without_a_value_drops_no_constraint(values, name):
         Constraints.from_mapping(values)
 
 
-@pytest.mark.parametrize("roll", [{"min": 46}, {"max": -46}, {"min": 90, "max": 90}])
+@pytest.mark.parametrize("roll", [{"min": 45.5}, {"max": -45.5}, {"min": 90, "max": 90}])
 def test_only_parts_are_rolled_beyond_an_eighth_of_a_turn(roll):
+    check_feasible(Constraints.from_mapping({"boresight": {"roll_deg": {"min": 45, "max": 45}}}), FACE)
     rules = {"boresight": {"roll_deg": roll}}
     with pytest.raises(InfeasibleError, match="exchanged"):
         check_feasible(Constraints.from_mapping(rules), FACE)
@@ -206,10 +251,3 @@ def test_bounds_that_are_probably_in_another_unit_are_questioned(override, quest
     notes = unit_notes(load_constraints(None, [override]), NEAR)
     assert len(notes) == (question is not None)
     assert all(re.search(question, note) for note in notes)
-
-
-def test_what_a_file_leaves_out_has_its_usual_value():
-    left_out = Constraints()
-    assert (left_out.budget.bin_ps, left_out.budget.bits_per_bin, left_out.budget.rate_hz) == (100, 40, 10)
-    assert (left_out.survive, left_out.least_sensors) == (0, 1)
-    assert Constraints(survive=1).least_sensors == 2

@@ -16,7 +16,7 @@ from lidardesign.errors import ConfigError
 from lidardesign.scenes.rays import DEFAULT_RATE_HZ, Rays
 from lidardesign.sensors.bandwidth import split_budget
 from lidardesign.sensors.design import DesignSpec
-from lidardesign.sensors.pattern import Pattern, even_rays
+from lidardesign.sensors.pattern import Pattern, even_rays, field_on_sphere
 from lidardesign.sensors.sensor import boresight_frame
 from lidardesign.space import direction
 
@@ -103,10 +103,17 @@ def test_all_even_rays_are_inside_the_field_of_view_also_straight_down(elevation
     assert len(np.unique(np.round(rays.direction, 9), axis=0)) == 137
 
 
-@pytest.mark.parametrize("count", [1, 50])
-def test_a_field_beyond_the_sphere_is_shrunk_so_that_no_ray_goes_round(count):
-    rays = DesignSpec("d", (sensor(spread_rad=(4.0, 2.0)),)).rays(count)
-    assert len(np.unique(np.round(rays.direction, 9), axis=0)) == count
+# half of the diagonals of these fields are 2.5, 3 and 3.5 rad
+@pytest.mark.parametrize(("field", "share"), [((3.0, 4.0), 1.0), ((3.6, 4.8), 1.0), ((4.2, 5.6), math.pi / 3.5)])
+def test_a_field_beyond_the_sphere_is_shrunk_so_that_no_ray_goes_round(field, share):
+    wide = replace(sensor(), field_of_view_rad=field)
+    np.testing.assert_allclose(field_on_sphere(wide), share * np.array(field))
+    assert len(np.unique(np.round(even_rays([wide], [50]).direction, 9), axis=0)) == 50
+
+
+def test_every_sensor_has_its_own_number_of_even_rays():
+    with pytest.raises(ValueError, match="zip"):
+        even_rays(EVEN.sensors, [5])
 
 
 def test_a_sensor_whose_field_has_no_width_fires_along_its_boresight():

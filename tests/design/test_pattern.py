@@ -14,7 +14,7 @@ from support.strategies import conditions, patterns
 
 from lidardesign.errors import ConfigError
 from lidardesign.scenes.rays import Rays
-from lidardesign.sensors.pattern import Pattern, with_coordinates
+from lidardesign.sensors.pattern import TRAVELLED, Pattern, low_discrepancy, with_coordinates
 from lidardesign.space import DIMENSIONS, angles, direction
 
 shares = st.floats(0, 1)
@@ -62,12 +62,13 @@ def test_between_knots_every_number_of_a_ray_is_linear(pattern, share):
 def test_rays_start_where_the_condition_is(pattern, share):
     value = between(pattern, share)
     assert (pattern.at(value).origin_m[:, DIMENSIONS.index(pattern.dimension)] == value).all()
+    assert len(TRAVELLED) == pattern.origin_m.shape[2]
 
 
 @pytest.mark.parametrize("value", [None, math.nan, math.inf, -0.1, 1.1])
 def test_beyond_the_ends_and_nowhere_there_are_no_rays(value):
     pattern = Pattern.along("x_m", [0.0, 1.0], [fan(0.0), fan(1.0)], (0.0, 1.0))
-    with pytest.raises(ConfigError, match=r"(?s)--at.*0 to 1"):
+    with pytest.raises(ConfigError, match=r"(?s)--at.*0 to 1" + (r".*--at x_m=0\.5" if value is None else "")):
         pattern.at(value)
 
 
@@ -122,14 +123,16 @@ def test_a_pattern_passes_through_the_lists_that_it_is_of():
 def test_rays_of_a_sensor_become_those_that_move_least_together(seed):
     generator = np.random.default_rng(seed)
     lists = []
-    for _ in range(2):
+    for _ in range(3):
         gate = np.sort(generator.uniform(1, 3, (4, 2)), axis=1)
         lists.append(Rays.from_angles(np.zeros((4, 3)), *generator.uniform(-1, 1, (2, 4)), gate, np.zeros(4, int)))
     aims = [one.direction * one.gate_m.mean(axis=1, keepdims=True) for one in lists]
     orders = [list(order) for order in itertools.permutations(range(4))]
-    best = min(orders, key=lambda order: np.square(aims[0] - aims[1][order]).sum())
-    pattern = Pattern.along("y_m", [0.0, 1.0], lists, (0.0, 1.0))
-    np.testing.assert_array_equal(pattern.gate_m[1], lists[1].gate_m[best])
+    pattern, best = Pattern.along("y_m", [0.0, 1.0, 2.0], lists, (0.0, 2.0)), range(4)
+    for place in (1, 2):
+        before = aims[place - 1][best]
+        best = min(orders, key=lambda order: np.square(before - aims[place][order]).sum())
+        np.testing.assert_array_equal(pattern.gate_m[place], lists[place].gate_m[best])
 
 
 def test_a_ray_keeps_to_its_sensor_though_another_sensors_ray_is_nearer():
@@ -151,12 +154,25 @@ def test_beyond_the_first_and_last_list_rays_stay_as_they_are_there(ends, furthe
         np.testing.assert_array_equal(there.gate_m, here.gate_m)
 
 
-def test_rays_pass_through_south_without_a_jump():
-    lists = [fan(x, turn=math.pi - 0.05) for x in KNOTS]
+@pytest.mark.parametrize("turn", [0.95, math.pi - 0.05])
+def test_rays_pass_through_north_and_south_without_a_jump(turn):
+    lists = [fan(x, turn) for x in KNOTS]
     wrapped = [Rays.from_angles(one.origin_m, *angles(one.direction), one.gate_m, one.sensor) for one in lists]
     pattern = Pattern.along("x_m", KNOTS, wrapped, ENDS)
     assert np.abs(np.diff(pattern.azimuth_rad, axis=0)).max() < 0.2
-    np.testing.assert_allclose(pattern.at(0.8).direction, fan(0.8, turn=math.pi - 0.05).direction, atol=1e-3)
+    np.testing.assert_allclose(pattern.at(0.8).direction, fan(0.8, turn).direction, atol=1e-3)
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.4, -2.0])
+def test_a_sensor_turned_about_the_vertical_turns_its_rays_by_as_much_at_every_knot(turn):
+    pattern, own = Pattern.along("x_m", KNOTS, [fan(x) for x in KNOTS], ENDS), OWNER == 1
+    rotation = np.stack([direction(turn, 0.0), direction(turn + math.pi / 2, 0.0), [0.0, 0.0, 1.0]], axis=1)
+    moved = pattern.remounted(1, np.array([9.0, 0.2, 0.0]), np.array([9.0, 0.5, 1.0]), rotation)
+    away = columns_of(moved) - columns_of(pattern)
+    expected = np.array([0.2 * math.sin(turn), 0.5 - 0.2 * math.cos(turn), 1.0, turn, 0.0, 0.0, 0.0])
+    # whole turns are the same at all knots
+    away[..., 3] -= 2 * math.pi * np.round((away[0, :, 3] - turn * own) / (2 * math.pi))
+    np.testing.assert_allclose(away, np.broadcast_to(own[:, None] * expected, away.shape), rtol=0, atol=1e-12)
 
 
 @given(patterns())
@@ -169,6 +185,13 @@ def test_the_pattern_of_a_list_is_the_list(pattern):
 
 
 # --- what it says of itself
+
+
+def test_a_pattern_stays_what_it_is_and_is_no_other():
+    pattern = Pattern.of(fan(0.0))
+    assert len({pattern, replace(pattern)}) == 2
+    with pytest.raises(AttributeError, match="cannot assign"):
+        pattern.dimension = "x_m"
 
 
 @given(patterns() | moving, st.dictionaries(st.integers(0, 2), st.floats(-9, 9)))
@@ -190,3 +213,23 @@ def test_gates_are_of_rays_where_two_of_a_sensor_differ_anywhere(pattern):
     assert pattern.gates == ("ray" if differ else "sensor")
     shared = np.broadcast_to(pattern.gate_m[:1, :1], pattern.gate_m.shape)
     assert Pattern(**{**vars(pattern), "gate_m": shared}).gates == "sensor"
+
+
+# --- even points
+
+
+def naive_even_points(count, axes):
+    """Multiples of a root's powers (Roberts), or of more axes whole numbers with their digits turned round (Halton)."""
+    if axes <= 2:
+        root = np.roots([1.0, *[0.0] * (axes - 1), -1.0, -1.0]).real.max()
+        return (0.5 + np.arange(1, count + 1)[:, None] / root ** np.arange(1, axes + 1)) % 1
+
+    def turned_round(number, base):
+        return number and (number % base + turned_round(number // base, base)) / base
+
+    return [[turned_round(number, prime) for prime in (7, 5, 3, 2)[-axes:]] for number in range(1, count + 1)]
+
+
+@pytest.mark.parametrize("axes", [1, 2, 3, 4])
+def test_even_points_are_those_of_their_papers(axes):
+    np.testing.assert_allclose(low_discrepancy(50, axes), naive_even_points(50, axes), rtol=0, atol=1e-12)

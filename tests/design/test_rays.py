@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from support.designs import SPACE, sensor
 
@@ -82,6 +82,7 @@ def test_a_budget_that_cannot_be_split_is_refused(weights, count):
 
 
 @settings(max_examples=200, deadline=None)
+@example(count=0, horizontal=1.0, vertical=1.0)
 @given(count=st.integers(0, 700), horizontal=st.floats(0, 6.2), vertical=st.floats(0, 3.1))
 def test_a_grid_has_exactly_its_rays_spread_over_rows_that_differ_by_one_at_most(count, horizontal, vertical):
     rows = grid_rows(horizontal, vertical, count)
@@ -96,6 +97,10 @@ def test_a_grid_has_exactly_its_rays_spread_over_rows_that_differ_by_one_at_most
     if count and min(horizontal, vertical) > 1e-3:
         assert len(np.unique(tangent, axis=0)) == count
         np.testing.assert_allclose(tangent.mean(axis=0)[0], 0, atol=1e-9)
+        # of all numbers of rows theirs has the cells that are closest to square
+        ratios = np.log(horizontal / vertical * np.square(np.arange(1, count + 1)) / count)
+        assert np.abs(ratios)[len(rows) - 1] <= np.abs(ratios).min() + 1e-9
+        assert np.abs(np.cumsum(rows) - np.arange(1, len(rows) + 1) * count / len(rows)).max() <= 0.5
 
 
 @given(across=st.integers(1, 25), up=st.integers(1, 25))
@@ -113,6 +118,7 @@ def test_a_field_without_height_or_width_is_one_even_row():
     row = 0.2 * np.arange(-2, 3)
     np.testing.assert_allclose(grid_tangent(1.0, 0.0, 5), np.stack([row, 0 * row], axis=1), atol=1e-15)
     np.testing.assert_allclose(grid_tangent(0.0, 1.0, 5), np.stack([0 * row, row], axis=1), atol=1e-15)
+    assert grid_rows(0.0, 0.0, 5).tolist() == [5]
 
 
 @given(st.integers(0, 1000), st.integers(0, 40))
@@ -121,6 +127,21 @@ def test_an_even_subset_has_its_number_of_distinct_points_in_their_order(seed, c
     kept = even_subset(points, count)
     assert len(np.unique(kept)) == len(kept) == count
     assert (np.diff(kept) > 0).all()
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize(("pieces", "size"), [(1, 9), (2, 5), (3, 1), (5, 3), (7, 5)])
+def test_an_even_subset_of_a_line_is_the_middle_of_equal_pieces(pieces, size, axis):
+    points = np.full((pieces * size, 2), 0.3)
+    points[:, axis] = np.arange(7, pieces * size + 7)
+    assert even_subset(points, pieces).tolist() == list(range(size // 2, pieces * size, size))
+
+
+@pytest.mark.parametrize(("above", "by_extent", "by_place"), [(4e-10, [0, 1], [2, 3]), (6e-10, [0, 2], [1, 3])])
+def test_less_than_half_a_billionth_does_not_decide_how_points_are_halved(above, by_extent, by_place):
+    corners = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0 + above], [1.0, 1.0 + above]])
+    assert even_subset(corners, 2).tolist() == by_extent
+    assert even_subset(np.array([[1.0], [0.5 + above], [0.5], [0.0]]), 2).tolist() == by_place
 
 
 # --- the sensor that fires a sample
