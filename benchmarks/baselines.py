@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import datetime
 import json
+import platform
 import sys
 import textwrap
 from collections.abc import Mapping
@@ -19,7 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from common import face_settings, lidardesign, machine, parser, report, run_process, table, verdict
+from common import face_settings, lidardesign, parser, report, run_process, table, verdict
 
 HELD_OUT_SEED = 2035  # of the scenes that designs are judged in: no choice, of a rule or of a number, was made on them
 SEEDS = 5
@@ -89,12 +90,8 @@ def measured(task: str, options: Any) -> dict[str, Any]:
 
 
 def measured_on() -> str:
-    """When and on what something was measured."""
-    found = machine()
-    return (
-        f"Measured on {datetime.date.today():%Y-%m-%d}: {found['processor']}, {found['cores']} cores, "
-        f"Python {found['python']}, load {found['load_at_start']} at the start."
-    )
+    """When and with what something was measured."""
+    return f"Measured on {datetime.date.today():%Y-%m-%d} with Python {platform.python_version()}."
 
 
 def standing(pair: Mapping[str, Any], better: str) -> str:
@@ -105,14 +102,17 @@ def standing(pair: Mapping[str, Any], better: str) -> str:
     return "better" if lower == (better == "lower") else "worse"
 
 
+def percent(pair: Mapping[str, Any] | None) -> str:
+    """By how much `a` is above `b` with its interval, in percent; nothing where that is not known."""
+    if pair is None or pair["percent"] is None:
+        return ""
+    middle, low, high = pair["percent"]
+    return f"{middle:+.1f} ({low:+.1f} to {high:+.1f})"
+
+
 def told(pair: Mapping[str, Any] | None, better: str) -> str:
     """By how much `a` is above `b` with its interval, in percent, and what the difference says."""
-    if pair is None:
-        return ""
-    if pair["percent"] is None:
-        return standing(pair, better)
-    middle, low, high = pair["percent"]
-    return f"{middle:+.1f} ({low:+.1f} to {high:+.1f}), {standing(pair, better)}"
+    return "" if pair is None else ", ".join(filter(None, [percent(pair), standing(pair, better)]))
 
 
 def ours_of(found: Mapping[str, Any]) -> list[str]:
@@ -176,14 +176,12 @@ def verdicts(found: Mapping[str, Any]) -> list[str]:
 
 
 def counted(found: Mapping[str, Any], name: str) -> str:
-    """The verdicts on one design in one sentence of numbers."""
+    """In how many comparisons one design is better than baselines that choose no rays, and worse than `greedy`."""
     others, greedy = zip(*(standings(found, name, key) for key in PAIRED), strict=True)
     first, second = (f"{sum(stands.values())} of {len(stands)}" for stands in others)
     third, fourth = (f"{len(stands) - sum(stands.values())} of {len(stands)}" for stands in greedy)
-    return (
-        f"`{name}` is better than baselines that choose no rays in {first} comparisons at equal rays and in {second} "
-        f"at equal bandwidth; it is worse than `greedy` in {third} and in {fourth}."
-    )
+    beaten = f"better than {first}, worse than `greedy` in {third}"
+    return f"`{name}`, equal rays: {beaten}; equal bandwidth: {second}, {fourth}."
 
 
 def page_tables(found: Mapping[str, Any]) -> list[str]:
@@ -191,7 +189,7 @@ def page_tables(found: Mapping[str, Any]) -> list[str]:
     rows = {(row["design"], row["rays"]): row for row in found["rows"]}
     counts = sorted({count for _, count in rows})
     middle = counts[(len(counts) - 1) // 2]
-    ours, better = ours_of(found)[0], found["metric"]["better"]
+    ours = ours_of(found)[0]
     pairs = {pair["b"]: pair for pair in found["paired"] if (pair["a"], pair["rays"]) == (ours, middle)}
     paired = {p["b"]: p for p in found["paired_equal_bandwidth"] if (p["a"], p["rays"]) == (ours, middle)}
     scores, differences = [], []
@@ -199,8 +197,7 @@ def page_tables(found: Mapping[str, Any]) -> list[str]:
         values = [rows[name, count]["value"] for count in counts]
         scores.append([f"`{name}`", *values, rows[name, middle]["bandwidth_mbps"]])
         if name in pairs:
-            at_its_bandwidth = told(paired.get(name), better)
-            differences.append([f"`{name}`", told(pairs[name], better), at_its_bandwidth])
+            differences.append([f"`{name}`", percent(pairs[name]), percent(paired.get(name))])
     columns = [found["metric"]["unit"], *(f"{count} rays" for count in counts), f"Mbit/s at {middle}"]
     against = [f"`{ours}` against", f"at {middle} rays, %", "in the same bandwidth, %"]
     return [table(columns, scores), table(against, differences)]
