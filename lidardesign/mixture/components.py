@@ -269,9 +269,9 @@ class Axes:
     horizontal: bool
     vertical: bool
     range: bool
-    azimuth_rad: float = 0.0
-    elevation_rad: float = 0.0
-    angle_scale: float = 1.0
+    azimuth_rad: float
+    elevation_rad: float
+    angle_scale: float
 
     @property
     def angular(self) -> int:
@@ -367,7 +367,7 @@ class Features:
     def angular_scale(self) -> float:
         """Root mean square angle of the directions from their mean, at most 1 rad and never 0 [rad]."""
         resultant = float(np.linalg.norm(np.einsum("kn,n->k", self.directions, self.weights)))
-        return min(max(math.sqrt(max(2 * (1 - resultant), 0.0)), IDLE_AXIS_SHARE), 1.0)
+        return math.sqrt(np.clip(2 * (1 - resultant), IDLE_AXIS_SHARE**2, 1.0))
 
     @cached_property
     def embedding(self) -> np.ndarray:
