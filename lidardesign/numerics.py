@@ -96,7 +96,7 @@ def safe_norm(vectors: Any, axis: int = -1) -> Any:
         squared = xp.sum(vectors * vectors, axis=axis)
     information = xp.finfo(vectors.dtype)
     # squares this large keep their digits
-    kept = (squared > information.smallest_normal / information.eps) & (squared < information.max)
+    kept = (squared > information.smallest_normal / information.eps) & xp.isfinite(squared)
     if bool(xp.all(kept)):
         return xp.sqrt(squared)
     largest = _constant(xp.max(xp.abs(vectors), axis=axis, keepdims=True))
@@ -123,9 +123,9 @@ def wrap_turn(angle_rad: Any, start_rad: float = 0.0) -> Any:
     xp, angle = _floats(angle_rad)
     past = angle - start_rad
     turned = xp.remainder(past, FULL_TURN)
-    # the remainder of a tiny negative number rounds to the full turn
-    turned = start_rad + xp.where(turned >= FULL_TURN, turned - FULL_TURN, turned)
-    return _scalar(xp.where((past >= 0) & (past < FULL_TURN), angle, turned))
+    # the remainder of a tiny negative number rounds to the full turn, that of what is inside is itself
+    wrapped = start_rad + xp.where(turned >= FULL_TURN, turned - FULL_TURN, turned)
+    return _scalar(xp.where(turned == past, angle, wrapped))
 
 
 def circular_difference(first_rad: Any, second_rad: Any) -> Any:
@@ -169,8 +169,7 @@ def angle_over_sine(angle_rad: Any) -> Any:
     near = squared < _series_limit(squared)
     # the sine of t, not of pi - t with a rounded pi, is exact up to the antipode
     sine = xp.sin(xp.where(near, xp.ones_like(angle), angle))
-    least = xp.finfo(angle.dtype).eps
-    far = angle / xp.where(sine < least, xp.full_like(sine, least), sine)
+    far = angle / xp.maximum(sine, xp.full_like(sine, xp.finfo(angle.dtype).eps))
     return _scalar(xp.where(near, _series(squared, ANGLE_OVER_SINE), far))
 
 
@@ -191,10 +190,9 @@ def normalised_weights(log_weights: Any) -> np.ndarray:
 def effective_count(weights: Any) -> float:
     r"""Effective number of weights, $(\sum w)^2 / \sum w^2$; 0 where all are 0."""
     weights = np.asarray(weights, dtype=np.float64)
-    largest = weights.max(initial=0.0)
-    if largest <= 0:
+    if not weights.any():
         return 0.0
-    scaled = weights / largest
+    scaled = weights / weights.max()
     return float(scaled.sum() ** 2 / np.square(scaled).sum())
 
 
@@ -247,7 +245,7 @@ def box_quadratic_minimum(
             gradient = np.einsum("kj,kj->k", precision[:, i], point - centre)
             point[:, i] = np.clip(point[:, i] - gradient / diagonal[:, i], low[:, i], high[:, i])
         if np.array_equal(before, point):
-            break
+            return point
     return point
 
 
@@ -298,7 +296,4 @@ def _series_limit(values: Any) -> float:
 
 def _series(squared: Any, coefficients: tuple[float, ...]) -> Any:
     """A polynomial in the square of an angle, by Horner's rule."""
-    total = coefficients[-1]
-    for coefficient in coefficients[-2::-1]:
-        total = coefficient + squared * total
-    return total
+    return functools.reduce(lambda total, coefficient: coefficient + squared * total, reversed(coefficients))

@@ -155,16 +155,15 @@ def _evaluated(mixture: Mixture, features: Features) -> Iterator[_Evaluated]:
     count, total = len(mixture), len(features)
     coefficients = linear_coefficients(mixture, features)
     rows = angular_rows(mixture, features.axes).reshape(3 * count, 3)
-    buffers = np.empty((6, count * min(BLOCK, total)))
+    buffer = np.empty(6 * count * min(BLOCK, total))
     for start in range(0, total, BLOCK):
         part = slice(start, min(start + BLOCK, total))
-        shape = count, part.stop - start
-        exponent, ratio, work = (buffers[i, : math.prod(shape)].reshape(shape) for i in (3, 4, 5))
-        cosines = buffers.reshape(-1)[: 3 * math.prod(shape)].reshape(3 * count, -1)
-        forward, horizontal, vertical = cosines.reshape(3, *shape)
+        width = part.stop - start
+        arrays = buffer[: 6 * count * width].reshape(6, count, width)
+        forward, horizontal, vertical, exponent, ratio, work = arrays
         np.matmul(coefficients, features.phi[:, part], out=exponent)
         if features.axes.angular:
-            np.matmul(rows, features.directions[:, part], out=cosines)
+            np.matmul(rows, features.directions[:, part], out=arrays[:3].reshape(3 * count, width))
             angle_ratio(forward, ratio, work)
             for tangent in (horizontal, vertical):
                 tangent *= ratio
