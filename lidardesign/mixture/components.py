@@ -287,14 +287,15 @@ class Axes:
         """The axes of a space with some origin coordinates pinned."""
         free = space.free
         cosine = 1.0 if ELEVATION in free else math.cos(space.low[ELEVATION])
+        off_pole = cosine > POLE_COSINE
         return cls(
             origin=tuple(i for i in range(3) if i in free and pinned[i] is None),
-            horizontal=AZIMUTH in free and cosine > POLE_COSINE,
+            horizontal=AZIMUTH in free and off_pole,
             vertical=ELEVATION in free,
             range=RANGE in free,
             azimuth_rad=space.low[AZIMUTH],
             elevation_rad=space.low[ELEVATION],
-            angle_scale=cosine if cosine > POLE_COSINE else 1.0,
+            angle_scale=cosine if off_pole else 1.0,
         )
 
     def directions(self, points: np.ndarray) -> np.ndarray:
