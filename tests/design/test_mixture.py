@@ -383,7 +383,7 @@ def test_the_scale_of_directions_is_their_spread_from_a_thousandth_to_one_radian
 
 def test_coordinates_have_mean_0_and_spread_1_and_a_part_keeps_their_units_also_where_an_axis_does_not_vary():
     _, features = case_of("all free")
-    points = features.points.copy()
+    points = features.points / [1, 1, 1, 9, 9, 1]
     points[:, 1] = 0.25
     features = features_of(points, WHOLE, 5 * features.weights)
     assert features.weights.sum() == pytest.approx(1)
