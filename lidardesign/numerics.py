@@ -239,14 +239,14 @@ def box_quadratic_minimum(precision: np.ndarray, centre: np.ndarray, low: np.nda
     point = np.clip(centre, low, high)
     if np.array_equal(point, centre):
         return point
-    count = centre.shape[1]
-    side = np.array(list(itertools.product((-1, 0, 1), repeat=count)))[:, None]
-    held, edge = side != 0, np.where(side < 0, low, high)
-    edge = np.where(np.isfinite(edge), edge, point)
+    free = np.full_like(centre, np.inf)
+    faces = itertools.product(*zip(low.T, free.T, high.T, strict=True))
+    edge = np.stack([np.stack(face, axis=-1) for face in faces])
+    held = np.isfinite(edge)
     # some roundings more of curvature: what is flat in float64 has a minimum too
-    curved = precision + CURVATURE * np.einsum("kii,ij->kij", precision, np.eye(count))
-    slopes = np.where(held[..., None], np.eye(count), curved)
-    away = np.linalg.solve(slopes, np.where(held, edge - centre, 0.0)[..., None])[..., 0]
+    curved = precision + CURVATURE * np.einsum("kii,ij->kij", precision, np.eye(len(centre.T)))
+    slopes = np.where(held[..., None], np.eye(len(centre.T)), curved)
+    away = np.linalg.solve(slopes, np.where(held, edge - centre, 0.0)[..., None]).squeeze(-1)
     points = np.where(held, edge, np.clip(centre + away, low, high))
     cost = np.einsum("fki,kij,fkj->fk", points - centre, precision, points - centre)
     return points[cost.argmin(axis=0), np.arange(len(centre))]
