@@ -240,8 +240,8 @@ def box_quadratic_minimum(precision: np.ndarray, centre: np.ndarray, low: np.nda
     if np.array_equal(point, centre):
         return point
     free = np.full_like(centre, np.inf)
-    faces = itertools.product(*zip(low.T, free.T, high.T, strict=True))
-    edge = np.stack([np.stack(face, axis=-1) for face in faces])
+    faces = itertools.product(*np.stack([low.T, free.T, high.T], axis=1))
+    edge = np.stack([np.stack(face, axis=1) for face in faces])
     held = np.isfinite(edge)
     # some roundings more of curvature: what is flat in float64 has a minimum too
     curved = precision + CURVATURE * np.einsum("kii,ij->kij", precision, np.eye(len(centre.T)))
