@@ -8,6 +8,7 @@ otherwise be NaN times zero.
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 from typing import Any
 
@@ -38,6 +39,8 @@ ROUNDING = 1e-12
 SLACK = 1e-9
 # Half of the digits, as of a difference of squares or of an angle from its cosine near 1.
 HALF_DIGITS = 1e-8
+# Curvature that is below what the rounding of a product of three matrices can add or take, relative to the largest.
+CURVATURE = 8 * EPSILON
 # Relative slack of values from float32 or from handwritten decimals.
 COARSE_SLACK = 1e-6
 
@@ -96,7 +99,7 @@ def safe_norm(vectors: Any, axis: int = -1) -> Any:
         squared = xp.sum(vectors * vectors, axis=axis)
     information = xp.finfo(vectors.dtype)
     # squares this large keep their digits
-    kept = (squared > information.smallest_normal / information.eps) & (squared < information.max)
+    kept = (squared > information.smallest_normal / information.eps) & xp.isfinite(squared)
     if bool(xp.all(kept)):
         return xp.sqrt(squared)
     largest = _constant(xp.max(xp.abs(vectors), axis=axis, keepdims=True))
@@ -123,9 +126,9 @@ def wrap_turn(angle_rad: Any, start_rad: float = 0.0) -> Any:
     xp, angle = _floats(angle_rad)
     past = angle - start_rad
     turned = xp.remainder(past, FULL_TURN)
-    # the remainder of a tiny negative number rounds to the full turn
-    turned = start_rad + xp.where(turned >= FULL_TURN, turned - FULL_TURN, turned)
-    return _scalar(xp.where((past >= 0) & (past < FULL_TURN), angle, turned))
+    # the remainder of a tiny negative number rounds to the full turn, that of what is inside is itself
+    wrapped = start_rad + xp.where(turned >= FULL_TURN, turned - FULL_TURN, turned)
+    return _scalar(xp.where(turned == past, angle, wrapped))
 
 
 def circular_difference(first_rad: Any, second_rad: Any) -> Any:
@@ -169,8 +172,7 @@ def angle_over_sine(angle_rad: Any) -> Any:
     near = squared < _series_limit(squared)
     # the sine of t, not of pi - t with a rounded pi, is exact up to the antipode
     sine = xp.sin(xp.where(near, xp.ones_like(angle), angle))
-    least = xp.finfo(angle.dtype).eps
-    far = angle / xp.where(sine < least, xp.full_like(sine, least), sine)
+    far = angle / xp.maximum(sine, xp.full_like(sine, xp.finfo(angle.dtype).eps))
     return _scalar(xp.where(near, _series(squared, ANGLE_OVER_SINE), far))
 
 
@@ -191,10 +193,9 @@ def normalised_weights(log_weights: Any) -> np.ndarray:
 def effective_count(weights: Any) -> float:
     r"""Effective number of weights, $(\sum w)^2 / \sum w^2$; 0 where all are 0."""
     weights = np.asarray(weights, dtype=np.float64)
-    largest = weights.max(initial=0.0)
-    if largest <= 0:
+    if not weights.any():
         return 0.0
-    scaled = weights / largest
+    scaled = weights / weights.max()
     return float(scaled.sum() ** 2 / np.square(scaled).sum())
 
 
@@ -230,25 +231,25 @@ def clipped_eigenvalues(matrices: np.ndarray, low: Any, high: Any = np.inf, smal
     return (rebuilt + np.swapaxes(rebuilt, -1, -2)) / 2
 
 
-def box_quadratic_minimum(
-    precision: np.ndarray, centre: np.ndarray, low: np.ndarray, high: np.ndarray, sweeps: int = 60
-) -> np.ndarray:
-    r"""Minimisers of $(x - c)^T P (x - c)$ in boxes, by exact coordinate descent: (K, n, n), (K, n) to (K, n).
+def box_quadratic_minimum(precision: np.ndarray, centre: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    r"""Minimisers of $(x - c)^T P (x - c)$ in boxes, which may be open: (K, n, n), (K, n) to (K, n).
 
-    Convex, so coordinate descent converges to the minimum; boxes that contain their centre are exact at once.
+    The minimum is that of one face of the box without its edges, of which there are 3^n with the inside: all are tried.
     """
     point = np.clip(centre, low, high)
     if np.array_equal(point, centre):
         return point
-    diagonal = np.einsum("kii->ki", precision)
-    for _ in range(sweeps):
-        before = point.copy()
-        for i in range(point.shape[1]):
-            gradient = np.einsum("kj,kj->k", precision[:, i], point - centre)
-            point[:, i] = np.clip(point[:, i] - gradient / diagonal[:, i], low[:, i], high[:, i])
-        if np.array_equal(before, point):
-            break
-    return point
+    free = np.full_like(centre, np.inf)
+    faces = itertools.product(*np.stack([low.T, free.T, high.T], axis=1))
+    edge = np.stack([np.stack(face, axis=1) for face in faces])
+    held = np.isfinite(edge)
+    # some roundings more of curvature: what is flat in float64 has a minimum too
+    curved = precision + CURVATURE * np.einsum("kii,ij->kij", precision, np.eye(len(centre.T)))
+    slopes = np.where(held[..., None], np.eye(len(centre.T)), curved)
+    away = np.linalg.solve(slopes, np.where(held, edge - centre, 0.0)[..., None]).squeeze(-1)
+    points = np.where(held, edge, np.clip(centre + away, low, high))
+    cost = np.einsum("fki,kij,fkj->fk", points - centre, precision, points - centre)
+    return points[cost.argmin(axis=0), np.arange(len(centre))]
 
 
 def _floats(*values: Any) -> tuple[Any, ...]:
@@ -298,7 +299,4 @@ def _series_limit(values: Any) -> float:
 
 def _series(squared: Any, coefficients: tuple[float, ...]) -> Any:
     """A polynomial in the square of an angle, by Horner's rule."""
-    total = coefficients[-1]
-    for coefficient in coefficients[-2::-1]:
-        total = coefficient + squared * total
-    return total
+    return functools.reduce(lambda total, coefficient: coefficient + squared * total, reversed(coefficients))

@@ -155,16 +155,15 @@ def _evaluated(mixture: Mixture, features: Features) -> Iterator[_Evaluated]:
     count, total = len(mixture), len(features)
     coefficients = linear_coefficients(mixture, features)
     rows = angular_rows(mixture, features.axes).reshape(3 * count, 3)
-    buffers = np.empty((6, count * min(BLOCK, total)))
+    buffer = np.empty(6 * count * min(BLOCK, total))
     for start in range(0, total, BLOCK):
         part = slice(start, min(start + BLOCK, total))
-        shape = count, part.stop - start
-        exponent, ratio, work = (buffers[i, : math.prod(shape)].reshape(shape) for i in (3, 4, 5))
-        cosines = buffers.reshape(-1)[: 3 * math.prod(shape)].reshape(3 * count, -1)
-        forward, horizontal, vertical = cosines.reshape(3, *shape)
+        width = part.stop - start
+        arrays = buffer[: 6 * count * width].reshape(6, count, width)
+        forward, horizontal, vertical, exponent, ratio, work = arrays
         np.matmul(coefficients, features.phi[:, part], out=exponent)
         if features.axes.angular:
-            np.matmul(rows, features.directions[:, part], out=cosines)
+            np.matmul(rows, features.directions[:, part], out=arrays[:3].reshape(3 * count, width))
             angle_ratio(forward, ratio, work)
             for tangent in (horizontal, vertical):
                 tangent *= ratio
@@ -269,9 +268,9 @@ class Axes:
     horizontal: bool
     vertical: bool
     range: bool
-    azimuth_rad: float = 0.0
-    elevation_rad: float = 0.0
-    angle_scale: float = 1.0
+    azimuth_rad: float
+    elevation_rad: float
+    angle_scale: float
 
     @property
     def angular(self) -> int:
@@ -288,14 +287,15 @@ class Axes:
         """The axes of a space with some origin coordinates pinned."""
         free = space.free
         cosine = 1.0 if ELEVATION in free else math.cos(space.low[ELEVATION])
+        off_pole = cosine > POLE_COSINE
         return cls(
             origin=tuple(i for i in range(3) if i in free and pinned[i] is None),
-            horizontal=AZIMUTH in free and cosine > POLE_COSINE,
+            horizontal=AZIMUTH in free and off_pole,
             vertical=ELEVATION in free,
             range=RANGE in free,
             azimuth_rad=space.low[AZIMUTH],
             elevation_rad=space.low[ELEVATION],
-            angle_scale=cosine if cosine > POLE_COSINE else 1.0,
+            angle_scale=cosine if off_pole else 1.0,
         )
 
     def directions(self, points: np.ndarray) -> np.ndarray:
@@ -367,7 +367,7 @@ class Features:
     def angular_scale(self) -> float:
         """Root mean square angle of the directions from their mean, at most 1 rad and never 0 [rad]."""
         resultant = float(np.linalg.norm(np.einsum("kn,n->k", self.directions, self.weights)))
-        return min(max(math.sqrt(max(2 * (1 - resultant), 0.0)), IDLE_AXIS_SHARE), 1.0)
+        return math.sqrt(np.clip(2 * (1 - resultant), IDLE_AXIS_SHARE**2, 1.0))
 
     @cached_property
     def embedding(self) -> np.ndarray:

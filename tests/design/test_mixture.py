@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import FrozenInstanceError, replace
 
 import numpy as np
 import pytest
@@ -13,6 +13,7 @@ from support.mixtures import POINT, WHOLE, Z, drawn, features_of, random_mixture
 
 from lidardesign.mixture.bounds import Bounds, Floors
 from lidardesign.mixture.components import (
+    Axes,
     Mixture,
     angle_ratio,
     expect,
@@ -26,7 +27,7 @@ from lidardesign.mixture.em import fit_mixture, run_em, seed_mixture
 from lidardesign.mixture.m_step import fit_field, fit_gate, maximise
 from lidardesign.numerics import logsumexp, wrap_angle
 from lidardesign.sensors.sensor import boresight_frame, tangent_coordinates, tangent_directions
-from lidardesign.space import DesignSpace, angles
+from lidardesign.space import DesignSpace, angles, direction
 
 
 @pytest.mark.parametrize("turn", [0.3, 1.7, 3.1, 5.9])
@@ -339,10 +340,60 @@ def test_a_component_without_weight_changes_nothing_and_its_logarithm_stays_fini
     assert expect(without, features).mass[1] < 1e-6
 
 
-def test_mixtures_and_their_statistics_are_themselves_alone_and_can_be_keys():
+@pytest.mark.parametrize("which", ["mixture", "statistics", "features", "axes"])
+def test_mixtures_and_what_they_are_fitted_to_never_change_and_arrays_are_themselves_alone(which):
     mixture, features = case_of("all free")
-    statistics = expect(mixture, features)
-    for one, same in ((mixture, taken(mixture, np.arange(3))), (statistics, expect(mixture, features))):
-        assert one == one
-        assert one != same
-        assert len({one, same}) == 2
+    ones = {"mixture": mixture, "statistics": expect(mixture, features), "features": features, "axes": features.axes}
+    one = ones[which]
+    same = replace(one)
+    assert one == one
+    assert (one == same) == (which == "axes")
+    assert len({one, same}) == 1 + (one != same)
+    for name in one.__dataclass_fields__:
+        with pytest.raises(FrozenInstanceError):
+            setattr(one, name, None)
+
+
+@pytest.mark.parametrize(
+    ("elevation", "turns", "scale"),
+    [
+        (0.0, True, 1.0),
+        (-0.7, True, math.cos(0.7)),
+        (math.pi / 2 - 1e-6, True, 1e-6),
+        (math.pi / 2 - 1e-10, False, 1.0),
+        (-math.pi / 2, False, 1.0),
+    ],
+)
+def test_angles_along_a_fixed_elevation_are_narrower_by_its_cosine_and_none_at_a_pole(elevation, turns, scale):
+    axes = Axes.of(DesignSpace((0.0, 0.0, 0.0, 0.5, elevation, 1.0), (1.0, 1.0, 0.0, 2.5, elevation, 1.0)))
+    assert (axes.origin, axes.horizontal, axes.vertical, axes.range) == ((0, 1), turns, False, False)
+    assert axes.angle_scale == pytest.approx(scale, rel=1e-6)
+    assert (axes.azimuth_rad, axes.elevation_rad) == (0.5, elevation)
+    assert Axes.of(WHOLE, (None, 1.0, None)).origin == (0, 2)
+    assert Axes.of(WHOLE).angle_scale == 1.0
+
+
+@pytest.mark.parametrize(
+    ("half", "scale"), [(0.0, 1e-3), (1e-4, 1e-3), (0.002, 0.002), (0.4, 2 * math.sin(0.2)), (1.1, 1.0), (1.57, 1.0)]
+)
+def test_the_scale_of_directions_is_their_spread_from_a_thousandth_to_one_radian(half, scale):
+    points = np.array([[0.0, 0.0, 0.0, azimuth, 0.0, 1.0] for azimuth in (1 - half, 1 + half)])
+    assert features_of(points, POINT).angular_scale == pytest.approx(scale, rel=1e-6)
+
+
+def test_coordinates_have_mean_0_and_spread_1_and_a_part_keeps_their_units_also_where_an_axis_does_not_vary():
+    _, features = case_of("all free")
+    points = features.points / [1, 1, 1, 9, 9, 1]
+    points[:, 1] = 0.25
+    features = features_of(points, WHOLE, 5 * features.weights)
+    assert features.weights.sum() == pytest.approx(1)
+    np.testing.assert_allclose(features.linear @ features.weights, 0, atol=1e-12)
+    np.testing.assert_allclose(np.square(features.linear) @ features.weights, [1, 0, 1, 1], atol=1e-12)
+    assert features.scale[1] == pytest.approx(1e-3 * (WHOLE.high[1] - WHOLE.low[1]))
+    part = features.subset(points[:, 0] > 0)
+    assert part.weights.sum() == pytest.approx(1)
+    np.testing.assert_array_equal(part.linear, features.linear[:, points[:, 0] > 0])
+    # distances that seed components add those of coordinates and of directions, each in its unit
+    looking = direction(points[:, 3], points[:, 4]).T / features.angular_scale
+    apart = sum(np.square(rows - rows[:, :1]).sum(axis=0) for rows in (features.linear, looking))
+    np.testing.assert_allclose(np.square(features.embedding - features.embedding[0]).sum(axis=1), apart, rtol=1e-12)
