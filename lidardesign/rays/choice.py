@@ -229,7 +229,7 @@ def _choose_layers(
     search = _Search(coverage, counts)
     if kept is not None:
         search.keep(kept)
-    search.improve(prices[0], limit_mbps, full=full, passes=passes if layered else 0)
+    search.improve(prices[0], limit_mbps, full=full, passes=passes * layered)
     # while this layer has rays and more may fire
     while layered and full and (search.gate >= 0).any() and (search.left > 0).any():
         search.begin_layer()

@@ -15,7 +15,7 @@ from support.coverages import SUMS, relaxed_by_highs, small
 from lidardesign.errors import PluginError
 from lidardesign.rays.certificate import certify
 from lidardesign.rays.choice import RayCounts, choose, choose_within
-from lidardesign.rays.coverage import LARGEST, Coverage, InformedScene, gather
+from lidardesign.rays.coverage import LARGEST, InformedScene, gather
 from lidardesign.rays.information import require_valid
 from lidardesign.task import Information
 
@@ -165,20 +165,6 @@ class TestAChoice:
             losses.append((best - choice.worth + price * choice.bits) / abs(best))
         assert min(losses) >= -1e-12
         assert np.mean(losses) <= 0.08
-
-
-@pytest.mark.parametrize("price", [0.0, 1e-6])
-def test_where_all_is_known_further_rays_see_everything_once_more(price):
-    # eight items, each of which two rays tell all about, one a little later than the other; and eight idle rays
-    items = np.repeat(np.arange(8), 2)
-    coverage = Coverage(
-        start=np.concatenate([np.arange(17), np.full(8, 16)]), item=items, worth=np.ones(16, dtype=np.float32),
-        gates=np.ones(16, dtype=np.uint8), weight=np.full(8, 1 / 8), bits=np.ones((24, 1)), harm=np.zeros((24, 1)),
-    )  # fmt: skip
-    chosen = choose(coverage, RayCounts.of_one(24, 12), price=price).rays
-    assert set(items[chosen]) == set(range(8))
-    assert (chosen < 16).all()
-    assert choose_within(coverage, RayCounts.of_one(24, 12), 12.0).rays.tolist() == chosen.tolist()
 
 
 @given(seed=seeds)
