@@ -155,14 +155,12 @@ class _Search:
 
     def fill(self, full: bool) -> None:
         """Take rays greedily until counts or bandwidth are used up, or none gains: net or, where `full`, hardly."""
-        rays = np.count_nonzero(self.gate >= 0)
         while True:
             ray, gate, net = self.best()
-            least = LEAST_SHARE * self.worth / max(rays, 1)
+            least = LEAST_SHARE * self.worth / max(np.count_nonzero(self.gate >= 0), 1)
             if net == -np.inf or (self.gains[ray, gate] <= least if full else net <= 0):
                 return
             self.take(ray, gate)
-            rays += 1
 
     def fill_up(self) -> None:
         """Take whatever rays fit, until counts or bandwidth are used up."""
