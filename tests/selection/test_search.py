@@ -56,7 +56,7 @@ def test_no_other_ray_in_the_place_of_one_is_better(table, seed, units, price, f
 
     def net(one):
         bits, harm = coverage.charge(one)
-        fits = bits <= budget * (1 + 1e-8) and (np.bincount(counts.group[one >= 0]) <= counts.most).all()
+        fits = bits <= budget * (1 + 1e-8) and (np.bincount(counts.group[one >= 0], minlength=2) <= counts.most).all()
         return coverage.value_of(one) - harm - price * bits if fits else -np.inf
 
     assert max(map(net, others), default=-np.inf) <= net(gate) + 1e-8 * choice.worth
