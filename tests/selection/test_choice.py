@@ -142,12 +142,6 @@ class TestAChoice:
         assert np.mean(ratios) >= 0.98
         assert min(ratios) >= 0.8
 
-    @given(seed=seeds)
-    def test_fires_as_many_rays_of_every_group_as_may_fire_however_dear_they_are(self, table, seed):
-        coverage, counts = small(seed, table=table), RayCounts(np.arange(7) % 2, np.array([2, 3]))
-        choice = choose(coverage, counts, price=10.0)
-        assert np.bincount(counts.group[choice.rays]).tolist() == [2, 3]
-
     @pytest.mark.parametrize(("most", "price"), [(3, 0.0), (3, 0.05), (3, 10.0), (5, 0.0), (5, 10.0)])
     def test_fires_a_ray_of_each_sensor_where_it_has_to_and_is_near_the_best_of_those(self, table, most, price):
         owner, losses = np.array([0, 0, 1, 1, 1, 2, 2]), []

@@ -60,7 +60,6 @@ def test_no_other_ray_in_the_place_of_one_is_better(table, seed, units, price, f
         return coverage.value_of(one) - harm - price * bits if fits else -np.inf
 
     assert max(map(net, others), default=-np.inf) <= net(gate) + 1e-8 * choice.worth
-    assert budget < np.inf or not owned or set(rays[gate >= 0] % 3) == {0, 1, 2}
 
 
 class TestLayers:
@@ -74,12 +73,13 @@ class TestLayers:
 
     @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
     @pytest.mark.parametrize("count", range(1, 12))
-    def test_follow_each_other_and_idle_rays_fire_last(self, count, scale):
+    def test_follow_each_other_however_dear_they_are_and_idle_rays_fire_last(self, count, scale):
         # two idle rays, then three of each item, which are worth 1, 3 and 2
         coverage = telling([[0, 0, 0], [0, 0, 0], *3 * np.eye(3).tolist()], weight=np.array([0.2, 0.6, 0.4]) * scale)
         order = [3, 4, 2, 6, 7, 5, 9, 10, 8, 0, 1]
         for full, most in ((True, count), (False, min(count, 3))):
-            assert choose(coverage, RayCounts.of_one(11, count), full=full).rays.tolist() == sorted(order[:most])
+            found = choose(coverage, RayCounts.of_one(11, count), full=full, price=scale * full)
+            assert found.rays.tolist() == sorted(order[:most])
 
     def test_are_as_cheap_as_the_first_where_a_bandwidth_has_to_last_for_all(self):
         # of each item two dear rays tell all and two cheap ones hardly less; eight idle rays are as cheap
@@ -118,10 +118,15 @@ class TestASwap:
         counts = RayCounts(np.zeros(3, dtype=int), np.array([3]), owner)
         assert choose(telling(np.eye(3), 1, [np.inf, 1, 1]), counts, price=0.1).rays.tolist() == [1, 2]
 
+    def test_takes_no_sensor_its_only_ray(self):
+        worth = [[0, 0, 0, 0, 0.1], [1, 1, 0, 0, 0], [1, 0, 0.5, 0, 0], [0, 1, 0, 0.5, 0], [0, 0, 0, 0, 0.25]]
+        counts = RayCounts(np.zeros(5, dtype=int), np.array([4]), np.array([0, 1, 1, 1, 1]))
+        assert choose(telling(worth), counts).rays.tolist() == [0, 2, 3, 4]
+
     def test_leaves_a_ray_to_every_sensor_beside_those_that_fire_in_any_case(self):
-        coverage = telling(np.eye(6), weight=np.arange(6, 0, -1.0))
         counts = RayCounts(np.zeros(6, dtype=int), np.array([3]), np.arange(6) // 2)
-        assert choose(coverage, counts, kept=np.array([-1, 0, -1, -1, -1, -1])).rays.tolist() == [1, 2, 4]
+        found = choose(telling(np.eye(6), np.arange(6, 0, -1.0)), counts, kept=np.where(np.arange(6) == 1, 0, -1))
+        assert found.rays.tolist() == [1, 2, 4]
 
 
 class TestTheBandwidth:
@@ -133,11 +138,10 @@ class TestTheBandwidth:
         assert found.price == pytest.approx(price * units[0] / units[1], rel=5e-3)
         assert found.bits <= budget * units[1] * (1 + 1e-8)
 
-    @pytest.mark.parametrize("full", [True, False])
-    def test_is_spent_by_swaps_where_no_price_does(self, full):
+    def test_is_spent_by_swaps_where_no_price_does(self):
         # at any price both items have their dear rays or both their cheap ones
         coverage = telling([*np.eye(2), *0.875 * np.eye(2)], 1, [2, 2, 1, 1])
-        found = choose_within(coverage, RayCounts.of_one(4, 2), 3.0, full=full)
+        found = choose_within(coverage, RayCounts.of_one(4, 2), 3.0)
         assert (found.worth, found.bits, len(found.rays)) == (1.875, 3, 2)
 
     def test_goes_to_as_many_rays_as_asked_before_it_goes_to_better_ones(self):
