@@ -157,7 +157,7 @@ class _Search:
         """Take rays greedily until counts or bandwidth are used up, or none gains: net or, where `full`, hardly."""
         while True:
             ray, gate, net = self.best()
-            least = LEAST_SHARE * self.worth / max(np.count_nonzero(self.gate >= 0), 1)
+            least = LEAST_SHARE * self.worth / max(int(np.count_nonzero(self.gate >= 0)), 1)
             if net == -np.inf or (self.gains[ray, gate] <= least if full else net <= 0):
                 return
             self.take(ray, gate)
