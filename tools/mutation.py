@@ -38,8 +38,8 @@ TESTS = {
         "design/test_pattern.py", "design/test_rays.py", "design/test_designs.py", "design/test_samplers.py",
     ),
     "lidardesign/rays/choice.py": (
-        "selection/test_choice.py", "selection/test_groups.py", "selection/test_certified.py",
-        "selection/test_selection.py", "selection/test_adaptive.py",
+        "selection/test_search.py", "selection/test_choice.py", "selection/test_groups.py",
+        "selection/test_certified.py", "selection/test_selection.py", "selection/test_adaptive.py",
     ),
 }  # fmt: skip
 # Packages and modules that a mutant is to meet anew; the tests are too.

@@ -155,14 +155,12 @@ class _Search:
 
     def fill(self, full: bool) -> None:
         """Take rays greedily until counts or bandwidth are used up, or none gains: net or, where `full`, hardly."""
-        rays = np.count_nonzero(self.gate >= 0)
         while True:
             ray, gate, net = self.best()
-            least = LEAST_SHARE * self.worth / max(rays, 1)
+            least = LEAST_SHARE * self.worth / max(int(np.count_nonzero(self.gate >= 0)), 1)
             if net == -np.inf or (self.gains[ray, gate] <= least if full else net <= 0):
                 return
             self.take(ray, gate)
-            rays += 1
 
     def fill_up(self) -> None:
         """Take whatever rays fit, until counts or bandwidth are used up."""
@@ -229,7 +227,7 @@ def _choose_layers(
     search = _Search(coverage, counts)
     if kept is not None:
         search.keep(kept)
-    search.improve(prices[0], limit_mbps, full=full, passes=passes if layered else 0)
+    search.improve(prices[0], limit_mbps, full=full, passes=passes * layered)
     # while this layer has rays and more may fire
     while layered and full and (search.gate >= 0).any() and (search.left > 0).any():
         search.begin_layer()

@@ -15,7 +15,7 @@ from support.coverages import SUMS, relaxed_by_highs, small
 from lidardesign.errors import PluginError
 from lidardesign.rays.certificate import certify
 from lidardesign.rays.choice import RayCounts, choose, choose_within
-from lidardesign.rays.coverage import LARGEST, Coverage, InformedScene, gather
+from lidardesign.rays.coverage import LARGEST, InformedScene, gather
 from lidardesign.rays.information import require_valid
 from lidardesign.task import Information
 
@@ -142,12 +142,6 @@ class TestAChoice:
         assert np.mean(ratios) >= 0.98
         assert min(ratios) >= 0.8
 
-    @given(seed=seeds)
-    def test_fires_as_many_rays_of_every_group_as_may_fire_however_dear_they_are(self, table, seed):
-        coverage, counts = small(seed, table=table), RayCounts(np.arange(7) % 2, np.array([2, 3]))
-        choice = choose(coverage, counts, price=10.0)
-        assert np.bincount(counts.group[choice.rays]).tolist() == [2, 3]
-
     @pytest.mark.parametrize(("most", "price"), [(3, 0.0), (3, 0.05), (3, 10.0), (5, 0.0), (5, 10.0)])
     def test_fires_a_ray_of_each_sensor_where_it_has_to_and_is_near_the_best_of_those(self, table, most, price):
         owner, losses = np.array([0, 0, 1, 1, 1, 2, 2]), []
@@ -165,20 +159,6 @@ class TestAChoice:
             losses.append((best - choice.worth + price * choice.bits) / abs(best))
         assert min(losses) >= -1e-12
         assert np.mean(losses) <= 0.08
-
-
-@pytest.mark.parametrize("price", [0.0, 1e-6])
-def test_where_all_is_known_further_rays_see_everything_once_more(price):
-    # eight items, each of which two rays tell all about, one a little later than the other; and eight idle rays
-    items = np.repeat(np.arange(8), 2)
-    coverage = Coverage(
-        start=np.concatenate([np.arange(17), np.full(8, 16)]), item=items, worth=np.ones(16, dtype=np.float32),
-        gates=np.ones(16, dtype=np.uint8), weight=np.full(8, 1 / 8), bits=np.ones((24, 1)), harm=np.zeros((24, 1)),
-    )  # fmt: skip
-    chosen = choose(coverage, RayCounts.of_one(24, 12), price=price).rays
-    assert set(items[chosen]) == set(range(8))
-    assert (chosen < 16).all()
-    assert choose_within(coverage, RayCounts.of_one(24, 12), 12.0).rays.tolist() == chosen.tolist()
 
 
 @given(seed=seeds)
