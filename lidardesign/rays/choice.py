@@ -24,7 +24,7 @@ SMALLEST_GAIN = SLACK  # of F, relative: what a swap must gain, so that rounding
 BISECTIONS = 12  # of the price of bandwidth
 NEAR_BUDGET = 0.98  # what spends this share of a budget is near enough: swaps within the budget spend the rest
 MOST_PASSES = 10  # of swaps
-LEAST_SHARE = 0.01  # of what a ray of a layer adds on average: where the best, net of its price, adds no more, another layer begins
+LEAST_SHARE = 0.01  # of what a ray of a layer adds on average: where the best, net, adds no more, another layer begins
 
 
 @dataclass(frozen=True, eq=False)
