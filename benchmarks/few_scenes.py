@@ -2,7 +2,8 @@
 
 For each seed and number of training heads a folder of heads is a task `meshes`; for each seed faces are learned with
 origins in a box. A design with a gate per ray stands beside `greedy`, the same choice from even candidates, in the same
-bandwidth. What was measured is kept in the folder.
+bandwidth. In the box rays of `greedy` start anywhere, those of a design at one place each, or all over regions.
+What was measured is kept in the folder.
 
     python benchmarks/few_scenes.py --folder few
 """
@@ -10,7 +11,7 @@ bandwidth. What was measured is kept in the folder.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,17 +21,21 @@ RAYS = "361"
 HELD_OUT, HELD_OUT_SEED = 40, 2026
 FEW = (5, 10, 20)  # training heads
 BOX_M = 0.15  # half the side of the box of origins
+REGIONS = ("--set", "origin.spread_m.max=10")
 
 
-def measured(run: Path, task: str, settings: Mapping[str, object], seed: int) -> dict[str, Any]:
-    """What `evaluate` prints of a run that is learned with some settings."""
-    path = run.with_suffix(".json")
+def measured(
+    run: Path, task: str, settings: Mapping[str, object], seed: int, name: str = "places", bounds: Sequence[str] = ()
+) -> dict[str, Any]:
+    """What `evaluate` prints of a design within bounds, of a run that is learned with some settings where it is not."""
+    path = run.with_name(f"{run.name}-{name}.json")
     if not path.exists():
         words = [word for key, value in settings.items() for word in ("--set", f"{key}={value}")]
         learn = ("learn", task, "--preset", "draft", "--seed", str(seed), "--out", run, *words)
-        fit = ("fit", run, "--name", "per-ray", "--gates", "ray", "--sensors", "4", "--rays", RAYS)
-        evaluate = ("evaluate", run, "--designs", "per-ray", "--rays", RAYS, "--scenes-seed", str(HELD_OUT_SEED))
-        for command in (learn, fit, evaluate):
+        usual = ("--name", name, "--gates", "ray", "--sensors", "4", "--rays", RAYS)
+        fit = ("constrain" if bounds else "fit", run, *bounds, *usual)
+        evaluate = ("evaluate", run, "--designs", name, "--rays", RAYS, "--scenes-seed", str(HELD_OUT_SEED))
+        for command in (fit, evaluate) if run.exists() else (learn, fit, evaluate):
             document = run_process(lidardesign(*command, "--json")).document()
         path.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
     return json.loads(path.read_text(encoding="utf-8"))
@@ -56,8 +61,8 @@ def folder_of_heads(folder: Path, train: int, seed: int) -> dict[str, object]:
 
 def row(found: Mapping[str, Any], label: str, seed: int) -> list[object]:
     """The design beside `greedy`, in the same bandwidth."""
-    ours = next(one for one in found["rows"] if one["design"] == "per-ray")
-    pair = next(one for one in found["paired_equal_bandwidth"] if (one["a"], one["b"]) == ("per-ray", "greedy"))
+    ours = found["rows"][0]
+    pair = next(one for one in found["paired_equal_bandwidth"] if (one["a"], one["b"]) == (ours["design"], "greedy"))
     difference = f"{pair['difference']:+.2f} ({pair['ci_low']:+.2f} to {pair['ci_high']:+.2f})"
     return [label, seed, ours["value"], ours["bandwidth_mbps"], difference]
 
@@ -77,7 +82,9 @@ def main() -> None:
             rows.append(row(found, f"{count} training heads", seed))
     for seed in range(options.seeds):
         settings = {"origin_box_m": BOX_M, "train": 200}
-        rows.append(row(measured(options.folder / f"box-{seed}", "face", settings, seed), "a box of origins", seed))
+        for name, bounds in (("places", ()), ("regions", REGIONS)):
+            found = measured(options.folder / f"box-{seed}", "face", settings, seed, name, bounds)
+            rows.append(row(found, f"a box of origins, {name}", seed))
     columns = ["faces", "seed", "design mm", "Mbit/s", "design minus greedy, mm"]
     report(
         "What the density adds to choosing rays", {f"{RAYS} rays, equal bandwidth": (columns, rows)}, [], options.json
