@@ -69,6 +69,9 @@ class Fork:
     def __init__(self, arguments: Sequence[str], folder: Path, step: int = 0, sent: int = signal.SIGKILL) -> None:
         self._started = time.monotonic()
         self._notes = Path(tempfile.mkdtemp())
+        # a signal may come before the fork has written anything
+        for name in (SAID, COUNTED):
+            (self._notes / name).touch()
         self._pid = os.fork()
         if self._pid == 0:
             _be_the_program(arguments, folder, self._notes, step, sent)
