@@ -155,8 +155,8 @@ def test_a_page_takes_what_was_measured_between_its_marks_and_keeps_the_rest(scr
     once = page.read_text()
     assert once.startswith("before\n\n<!-- face -->\n\nError in mm on 3 held-out scenes. Measured here.")
     assert once.endswith("<!-- face -->\n\nafter\n")
-    assert "| `bounding` | -10.0 (-18.0 to -2.0), better" in " ".join(once.split())
-    assert "better than baselines that choose no rays in 1 of 1 comparisons" in once
+    assert "| `bounding` | -10.0 (-18.0 to -2.0) |" in " ".join(once.split())
+    assert "`fit`, equal rays: better than 1 of 1," in once
     assert "old" not in once
     script("baselines").write_page(page, {"face": found})
     assert page.read_text() == once
