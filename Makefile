@@ -102,7 +102,7 @@ coverage: $(BIN)/.dev
 	$(KERNELS) report --rcfile=/dev/null --data-file=build/kernels.coverage --include='*kernels.py'
 	$(BIN)/python -m coverage report --fail-under=95
 
-# Small changes of the core's code, and how many of them its tests notice: an hour
+# Small changes of the core's code, and how many of them its tests notice: half an hour
 mutation: $(BIN)/.dev
 	$(BIN)/python tools/mutation.py --out docs/soak/mutation-$$(date -u +%F).md $(if $(AMOUNT),--sample $(AMOUNT))
 
