@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import Any
 
 from common import face_scenes, lidardesign, parser, report, run_process
+from robots import REGIONS
 
 RAYS = "361"
 HELD_OUT, HELD_OUT_SEED = 40, 2026
 FEW = (5, 10, 20)  # training heads
 BOX_M = 0.15  # half the side of the box of origins
-REGIONS = ("--set", "origin.spread_m.max=10")
 
 
 def measured(
@@ -82,7 +82,7 @@ def main() -> None:
             rows.append(row(found, f"{count} training heads", seed))
     for seed in range(options.seeds):
         settings = {"origin_box_m": BOX_M, "train": 200}
-        for name, bounds in (("places", ()), ("regions", REGIONS)):
+        for name, bounds in (("places", ()), ("regions", ("--set", REGIONS))):
             found = measured(options.folder / f"box-{seed}", "face", settings, seed, name, bounds)
             rows.append(row(found, f"a box of origins, {name}", seed))
     columns = ["faces", "seed", "design mm", "Mbit/s", "design minus greedy, mm"]

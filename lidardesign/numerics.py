@@ -39,7 +39,7 @@ ROUNDING = 1e-12
 SLACK = 1e-9
 # Half of the digits, as of a difference of squares or of an angle from its cosine near 1.
 HALF_DIGITS = 1e-8
-# Curvature that is below what the rounding of a product of three matrices can add or take, relative to the largest.
+# Curvature below what the rounding of a product of three matrices can add or take, relative to that of the same axis.
 CURVATURE = 8 * EPSILON
 # Relative slack of values from float32 or from handwritten decimals.
 COARSE_SLACK = 1e-6
