@@ -482,7 +482,7 @@ def twin_samples(run: RunFolder) -> Samples:
         random_generator(config.seed, "no visibility"),
     )
     if not len(samples):
-        raise DataError("no ray of the design space comes near a target", where=f"--baseline {TWIN_NAME}")
+        raise DataError("no ray of the design space comes near a target")
     return samples
 
 
@@ -504,11 +504,11 @@ def twin_without_visibility(
         samples: The samples, which several twins may share; None draws them.
 
     Raises:
-        DataError: No ray of the design space comes near a target.
+        DataError: No ray of the design space comes near a target, or too few for so many sensors.
+        InfeasibleError: The twin cannot keep the design's constraints.
     """
     seed = design.provenance.get("seed")
     seed = seed if isinstance(seed, int) else 0
-    drawn = twin_samples(run) if samples is None else samples()
     document = {key: value for key, value in design.constraints.items() if key != "parts"}
     if rays == 1:
         document.pop("survive", None)
@@ -535,4 +535,10 @@ def twin_without_visibility(
         certify=False,
     )
     target = RunTarget(run, visibility="off")
-    return fit_design(request, notes=ignore, samples=drawn, target=target).design
+    try:
+        drawn = twin_samples(run) if samples is None else samples()
+        return fit_design(request, notes=ignore, samples=drawn, target=target).design
+    except (DataError, InfeasibleError) as error:
+        error.where, error.hint = f"--baseline {TWIN_NAME}", "evaluate without it"
+        error.args = (error.render(),)
+        raise

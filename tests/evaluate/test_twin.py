@@ -12,9 +12,9 @@ from support.sensors import normal_sensor
 from lidardesign.constraints.check import check_design
 from lidardesign.constraints.document import Constraints
 from lidardesign.density.objective.proposals import samples_without_visibility
-from lidardesign.errors import InfeasibleError
+from lidardesign.errors import DataError, InfeasibleError
 from lidardesign.fitting import fit as fit_module
-from lidardesign.fitting.fit import fit_design, twin_without_visibility
+from lidardesign.fitting.fit import fit_design, twin_samples, twin_without_visibility
 from lidardesign.fitting.options import FitOptions
 from lidardesign.fitting.request import FitRequest, RunTarget
 from lidardesign.run_folder import RunFolder
@@ -123,6 +123,15 @@ def test_rays_of_real_parts_and_rings_have_even_rays_beside_them(fitted):
     assert twin.rays_per_sensor(RAYS).sum() == RAYS
     # sensors that all fire are no more than rays
     assert len(twin_without_visibility(part, run, 1).sensors) == 1
+
+
+def test_a_twin_that_cannot_be_fitted_says_which_baseline_to_leave_out(fitted):
+    run, design = fitted["chosen"]
+    drawn = twin_samples(run)
+    few = replace(drawn, **{name: getattr(drawn, name)[:20] for name in ("points", "log_prob", "log_target")})
+    with pytest.raises(DataError, match="--baseline no-visibility: the density is too rough") as refused:
+        twin_without_visibility(design, run, RAYS, samples=lambda: few)
+    assert "without" in refused.value.hint
 
 
 @pytest.mark.parametrize("most", [24, 23, 5, 1])
