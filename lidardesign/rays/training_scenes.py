@@ -94,9 +94,9 @@ class TrainingScenes:
             share: The share of the candidates that will be chosen.
         """
         kept = self._first.get(purpose, [])
-        scenes = kept[start:stop] if stop <= len(kept) else itertools.islice(self.scenes(purpose, start), stop - start)
+        scenes = itertools.chain(kept[start:], self.scenes(purpose, max(start, len(kept))))
         work = partial(informed_scene, self.run.task, rays, visits, share, self.seed, purpose)
-        return self.over(work, scenes, start)
+        return self.over(work, itertools.islice(scenes, stop - start), start)
 
     def over(self, work: Callable[[Scene, int], Found], scenes: Iterable[Scene], start: int = 0) -> list[Found]:
         """What some work finds in scenes and their numbers, here or by workers."""

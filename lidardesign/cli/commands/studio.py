@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import webbrowser
 from pathlib import Path
 from typing import Annotated
 
@@ -50,5 +49,7 @@ def studio(
             signal.signal(signal.SIGINT, lambda *_: page.end())
             print(page.address, flush=True)
             if not no_browser:
+                import webbrowser
+
                 webbrowser.open(page.address)
             page.wait()
