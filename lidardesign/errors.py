@@ -64,9 +64,9 @@ class LidardesignError(Exception):
         self, message: str, *, where: str | None = None, allowed: str | None = None, hint: str | None = None
     ) -> None:
         self.message, self.where, self.allowed, self.hint = _short(message), _short(where), _short(allowed), hint
-        super().__init__(self.render())
+        super().__init__(message)
 
-    def render(self) -> str:
+    def __str__(self) -> str:
         """The whole message: location, finding, allowed values, next step."""
         text = f"{self.where}: {self.message}" if self.where else self.message
         if self.allowed:
@@ -79,7 +79,6 @@ class LidardesignError(Exception):
         """Replace names of command options in the message by names of function arguments."""
         texts = (self.message, self.where, self.allowed, self.hint)
         self.message, self.where, self.allowed, self.hint = map(_as_argument, texts)
-        self.args = (self.render(),)
 
     def as_dict(self) -> dict[str, object]:
         """Content of the error for `--json`."""

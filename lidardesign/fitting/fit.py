@@ -91,7 +91,6 @@ def fit_design(
         result = fitter.fit()
     except InfeasibleError as error:
         error.hint = _wider_run(request, error.conflicts) or error.hint
-        error.args = (error.render(),)
         raise
     for note in result.notes:
         notes(note)
@@ -540,5 +539,4 @@ def twin_without_visibility(
         return fit_design(request, notes=ignore, samples=drawn, target=target).design
     except (DataError, InfeasibleError) as error:
         error.where, error.hint = f"--baseline {TWIN_NAME}", "evaluate without it"
-        error.args = (error.render(),)
         raise
