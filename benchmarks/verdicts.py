@@ -29,8 +29,8 @@ TASKS = {
     "warehouse": (("warehouse",), 2, 24),
     "arm": (("arm",), 4, 400),
 }
-# The share of misplaced mass at which learning stops and the most steps: more than it takes, or too few to learn well.
-MANY = 5000
+# The share of misplaced mass at which learning stops and the most steps: those of the finest preset, or too few.
+MANY = 2000
 LENGTHS = ((0.0, 10), (0.0, 30), (0.25, MANY), (0.15, MANY), (0.1, MANY), (0.05, MANY))
 FIGURES = ("misplaced", "kl_nats", "ess")
 FITS = 3
