@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import shutil
 import sys
@@ -13,6 +14,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import numpy as np
 import pytest
+import typer
 from hypothesis import HealthCheck, settings
 
 settings.register_profile("dev", max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -51,9 +53,13 @@ SMALL = {
 
 
 @pytest.fixture(autouse=True, scope="session")
-def choices_look_at_few_scenes():
-    """Rays and sensors are chosen as users choose them, but on fewer scenes: those take half a minute."""
+def work_is_shortened():
+    """Rays and sensors are chosen as users choose them, but on fewer scenes: those take half a minute.
+
+    The command line is built once, not by every command.
+    """
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(typer.main, "get_command", functools.cache(typer.main.get_command))
         for name, (number, modules) in SMALL.items():
             for module in modules.split():
                 patch.setattr(f"lidardesign.{module}.{name}", number)
