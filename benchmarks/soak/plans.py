@@ -202,8 +202,8 @@ def _evaluate_options(generator: np.random.Generator, layout: str, *, reach_m: f
 
 
 POINTS = 20_000
-# Beyond so many spreads the surface term is below 2e-8.
-NEAR_SIGMAS = 6.0
+# Where every ray passes the targets further away than this, learning may say that none reaches them.
+NEAR_SIGMAS = 1.0
 
 
 def share_near_targets(plan: RunPlan) -> float:

@@ -7,6 +7,7 @@ import subprocess
 import sys
 
 import pytest
+import typer
 
 from lidardesign.cli.terminal import options as completion
 from lidardesign.simulate.detector.files import load_detector
@@ -48,7 +49,8 @@ def test_what_fails_while_a_shell_asks_says_nothing():
 
 
 def test_the_script_of_a_shell_is_shown(lidardesign, monkeypatch):
-    # a suite may be run by no shell at all
+    # a suite may be run by no shell at all, which is asked when the command line is built
+    monkeypatch.setattr(typer.main, "get_command", typer.main.get_command.__wrapped__)
     monkeypatch.setenv("_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION", "1")
     assert "_LIDARDESIGN_COMPLETE" in lidardesign("--show-completion", "bash").out
 
