@@ -42,10 +42,10 @@ SETS: dict[str, tuple[str, ...]] = {
 
 def constrain(run: Path, name: str) -> ProcessResult:
     """One whole process."""
-    words = ["constrain", run, *EVEN, "--set", "sensors.count=4", "--json", "--name", "benchmark"]
-    for setting in SETS[name]:
-        words += ["--set", setting]
-    return run_process(lidardesign(*words))
+    own = SETS[name]
+    settings = own if any(one.startswith("sensors.count") for one in own) else ("sensors.count=4", *own)
+    words = [word for setting in settings for word in ("--set", setting)]
+    return run_process(lidardesign("constrain", run, *EVEN, *words, "--json", "--name", "benchmark"))
 
 
 def again(run: Path, folder: Path) -> dict[str, ProcessResult]:

@@ -206,7 +206,7 @@ ROUGH = settings("train=3", "density.sigma_m=0.04")
 SMALLEST = [
     ("arm", ["--preset", "draft", *SMALL_ARM, "--sensors", "2", "--rays", "40"]),
     ("commands", ROUGH),
-    ("constrain", [*FACE, *ROUGH, "--only", "none"]),
+    ("constrain", [*FACE, *ROUGH, "--only", "none", "--only", "10 sensors"]),
     ("fields", [*FACE, "--scenes", "2", "--resolution", "24", "--trimesh-points", "50"]),
     ("flow", ["--batch", "64", "--layers", "2", "--bins", "4", "--hidden", "8"]),
     ("frames", ["--robot", "embedded", "--trajectories", "2", "--frames", "12", "--points", "64", "--casters", "6"]),
