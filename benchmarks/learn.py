@@ -89,6 +89,7 @@ def by_preset(options: Any, settings: list[str], cache: Path) -> list[list[objec
 
 def until_kl(options: Any, settings: list[str], cache: Path) -> tuple[list[list[object]], list[str]]:
     """Rows of ever smaller goals down to the first whose divergence is small enough, and what follows."""
+    settings = [one for one in settings if not one.startswith("learning.steps=")]
     learn(options.task, "standard", 0, [*settings, "learning.steps=1"], cache)
     rows: list[list[object]] = []
     for goal in options.goals:

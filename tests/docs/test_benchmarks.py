@@ -212,7 +212,7 @@ SMALLEST = [
     ("frames", ["--robot", "embedded", "--trajectories", "2", "--frames", "12", "--points", "64", "--casters", "6"]),
     ("growth", [*FACE, "--of", "rays", "--rays", "100", "200", "--samples", "2000", "--heads", "2", "--batch", "64"]),
     ("learn", [*FACE, "--preset", "draft", *ROUGH, "--goals", "0.95", "--kl", "1000"]),
-    ("occlusion", [*SMALL_ARM, "--preset", "draft", "--rays", "20", "40", "--further-rays", "60"]),
+    ("occlusion", [*SMALL_ARM, "--preset", "draft", "--rays", "40", "80", "--further-rays", "120"]),
     ("raycasting", [*FACE, "--rays", "2000", "--checked", "100"]),
     ("baselines", ["--folder", "kept", "--task", "warehouse", "--preset", "draft", *SMALL_WAREHOUSE, "--rays", "6"]),
     ("selection", [*FACE, "--scenes", "4", "8", "--candidates", "100", "200", "--count", "25", "--problems", "2"]),
