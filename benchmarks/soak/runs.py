@@ -158,7 +158,7 @@ class _Doing:
 
     def _check_refusal(self, code: int, found: dict[str, Any], name: str) -> None:
         error = found.get("error", {})
-        if code == TOO_ROUGH and TOLD_NOTHING in _message(found):
+        if TOLD_NOTHING in _message(found):
             return  # constraints let sensors look past all targets
         self._expect(code == INFEASIBLE, f"constrain ended with {code}: {_message(found)}")
         # a pinned origin has no mass: then the samples that are left are told

@@ -108,8 +108,8 @@ def choose_rays(
 
     Raises:
         ConfigError: More rays than can be chosen.
-        DataError: No ray inside the sensors has information about the training scenes.
-        InfeasibleError: A bandwidth in which no choice of so many rays fits.
+        InfeasibleError: No ray inside the sensors has information about the training scenes, or no choice of so many
+            rays fits within the bandwidth.
     """
     constraints, counts, level, gates = request.constraints, request.counts, request.level, request.gates
     check_number(counts[-1], "--rays", 1, MOST_SELECTED)

@@ -22,7 +22,7 @@ import numpy as np
 from lidardesign.constraints.document import Constraints, SensorRules
 from lidardesign.constraints.feasibility import BandwidthBudget, check_feasible
 from lidardesign.constraints.origins import inside_excluded, mounts_of, origin_box
-from lidardesign.errors import BackgroundNote, ConfigError, DataError, InfeasibleError
+from lidardesign.errors import BackgroundNote, ConfigError, InfeasibleError
 from lidardesign.fitting.part_sets import ChosenSet, SetLimits, choose_set, further_sets, value_of
 from lidardesign.fitting.part_shapes import (
     PartBundle,
@@ -98,8 +98,8 @@ def choose_parts(
 
     Raises:
         ConfigError: A part that is not there; a density with conditions.
-        InfeasibleError: Constraints that contradict each other, or that no part keeps; fewer rays than parts.
-        DataError: No part has information about the scenes.
+        InfeasibleError: Constraints that contradict each other, or that no part keeps; fewer rays than parts; no part
+            has information about the scenes.
     """
     started, space, constraints, count = perf_counter(), samples.space, request.constraints, request.sensors
     check_feasible(constraints, space, sensors=request.fewest or count, rays=request.rays)
@@ -295,7 +295,7 @@ def _enough_scenes(
     """The information of all parts about enough scenes, at most so many, the best set by it, and the scenes.
 
     Raises:
-        DataError: No part has information about the scenes.
+        InfeasibleError: No part has information about the scenes.
     """
     held_back, scenes = training.first(HELD_BACK), training.scenes(CHOICE)
     wanted, loss = information.FEW_SCENES, np.inf
@@ -308,7 +308,7 @@ def _enough_scenes(
         with phase("choice"):
             chosen = choose_set(coverage, limits)
         if not chosen.members:
-            raise DataError(
+            raise InfeasibleError(
                 "none of the parts tells anything about the scenes",
                 where="--parts",
                 hint="parts whose ranges reach the targets, or looser bounds of gate, boresight and origin",

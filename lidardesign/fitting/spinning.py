@@ -19,7 +19,7 @@ import numpy as np
 from lidardesign.constraints.document import Constraints
 from lidardesign.constraints.feasibility import check_feasible
 from lidardesign.constraints.origins import inside_excluded, mounts_of, origin_box
-from lidardesign.errors import ConfigError, DataError
+from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.fitting.options import refuse_first
 from lidardesign.fitting.request import FitResult
 from lidardesign.numerics import FULL_TURN
@@ -127,8 +127,7 @@ def choose_rings(
     Raises:
         ConfigError: Rays that rings cannot share, more channels than elevations, more sets of places than can be
             tried, or a density with conditions.
-        DataError: No ring has information about the scenes.
-        InfeasibleError: Constraints that contradict each other.
+        InfeasibleError: Constraints that contradict each other, or no ring has information about the scenes.
     """
     started, space, rings = perf_counter(), samples.space, count * max(channels, 1)
     check_feasible(constraints, space, sensors=count, rays=rays)
@@ -139,7 +138,7 @@ def choose_rings(
     with phase("what returns tell"), information.choosing(rings / len(first)):
         told, _ = first.coverage(every, scenes("choice"), informs, FIRST_SHARE)
         if not len(told.item):
-            raise DataError(f"none of {len(first)} rings tells anything about the training scenes", where=name)
+            raise InfeasibleError(f"none of {len(first)} rings tells anything about the training scenes", where=name)
         gains = told.gains(np.zeros(len(told.weight)))[:, 0].reshape(-1, elevations).sum(axis=0)
         candidates = replace(first, elevation_rad=refine_elevations(even, gains))
         coverage, unit = candidates.coverage(every, scenes("choice"), informs)

@@ -78,7 +78,7 @@ def pool_of(
         progress: Called with every step.
 
     Raises:
-        DataError: No ray has information about the scenes.
+        InfeasibleError: No ray has information about the scenes.
     """
     conditions, counts = run.conditions(), sorted(run.task.defaults.rays)
     size = POOL_FACTOR * CANDIDATES_PER_RAY * min(counts[-1], MOST_SELECTED)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from lidardesign.errors import DataError, InfeasibleError
+from lidardesign.errors import InfeasibleError
 from lidardesign.numerics import SLACK
 from lidardesign.rays.certificate import certificate_document, certify, price_curve
 from lidardesign.rays.choice import MOST_PASSES, Choice, RayCounts, choose, choose_within
@@ -76,10 +76,10 @@ class Selection:
         """Refuse candidates without any information.
 
         Raises:
-            DataError: None informs about any item.
+            InfeasibleError: None informs about any item.
         """
         if not len(coverage.item):
-            raise DataError(
+            raise InfeasibleError(
                 f"none of {len(self.rays)} candidate rays tells anything about {scenes} training scenes",
                 where=self.name,
                 hint="let sensors look at the targets: constrain less, or learn longer",
@@ -226,8 +226,8 @@ def select(
         progress: Called with every step.
 
     Raises:
-        DataError: No candidate has information about the scenes.
-        InfeasibleError: A bandwidth in which no choice of so many rays fits.
+        InfeasibleError: No candidate has information about the scenes, or no choice of so many rays fits within the
+            bandwidth.
     """
     gates_m = selection.gates(selection.rays, selection.visits, informed)
     coverage, judged = selection.coverage(informed, gates_m), selection.coverage(held_back, gates_m)
@@ -293,7 +293,7 @@ def inform_enough(
         progress: Called with every step.
 
     Raises:
-        DataError: No candidate has information about the scenes.
+        InfeasibleError: No candidate has information about the scenes.
     """
     rays, visits = selection.rays, selection.visits
     # with several values of a condition each sees little of a scene

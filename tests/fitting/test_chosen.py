@@ -128,7 +128,7 @@ class TestTheCommand:
         nothing = Information(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(5, int))
         monkeypatch.setattr(training_scenes, "checked_information", lambda task, scene, returns: nothing)
         refused = lidardesign("fit", run, "--rays", 4)
-        assert refused.code == 3
+        assert refused.code == 4
         assert "tells anything about 5 training scenes" in refused.err
 
     def test_needs_a_task_that_says_what_returns_tell(self, lidardesign, run, monkeypatch):
