@@ -118,7 +118,7 @@ soak: soak-benchmarks soak-runs soak-seeds soak-kills fuzz mutation
 soak-benchmarks: $(BIN)/.dev
 	$(BIN)/python -m pytest -m long tests/docs
 
-# 300 runs of random configurations, some 200 of them whole: no fault, every constraint kept, the same bytes when done again
+# 300 runs of random configurations, some 120 of them whole: no fault, every constraint kept, the same bytes when done again
 soak-runs: $(BIN)/.dev
 	$(LONG) benchmarks/soak/runs.py --amount $(or $(AMOUNT),300)
 

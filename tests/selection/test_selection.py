@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from support.coverages import scene_of
 from support.rays import random_fan, rays_along
 
-from lidardesign.errors import DataError, InfeasibleError
+from lidardesign.errors import InfeasibleError
 from lidardesign.rays.coverage import LARGEST
 from lidardesign.rays.selection import Selection, select, silent_share
 from lidardesign.sensors.bandwidth import Bandwidth, split_budget
@@ -120,5 +120,5 @@ def test_scenes_about_which_no_return_in_a_gate_tells_anything_are_silent(seed):
 def test_candidates_that_tell_nothing_are_refused():
     selection, informed, held_back = subject(0)
     none = [one.of_rays(np.full(10, -1)) for one in informed]
-    with pytest.raises(DataError, match="none of 10 candidate rays"):
+    with pytest.raises(InfeasibleError, match="none of 10 candidate rays"):
         select(selection, none, held_back, [3])
