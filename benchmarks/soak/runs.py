@@ -138,8 +138,11 @@ class _Doing:
             self._check_design("held", rules)
             return
         self._check_refusal(code, found, "held")
-        is_kept = not is_loose or TOO_ROUGH_WORDS.search(_message(found))
-        self._expect(bool(is_kept), f"constrain: bounds that the fit keeps were refused: {_message(found)}; {rules}")
+        few_are_left = TOO_ROUGH_WORDS.search(_message(found)) is not None
+        self._expect(
+            not is_loose or few_are_left,
+            f"constrain: bounds that the fit keeps were refused: {_message(found)}; {rules}",
+        )
 
     def _contradict(self) -> None:
         options = contradictions(self.space, self.plan.sensors)
@@ -158,9 +161,9 @@ class _Doing:
 
     def _check_refusal(self, code: int, found: dict[str, Any], name: str) -> None:
         error = found.get("error", {})
+        self._expect(code == INFEASIBLE, f"constrain ended with {code}: {_message(found)}")
         if TOLD_NOTHING in _message(found):
             return  # constraints let sensors look past all targets
-        self._expect(code == INFEASIBLE, f"constrain ended with {code}: {_message(found)}")
         # a pinned origin has no mass: then the samples that are left are told
         mass = error.get("admissible_mass") is not None or "effective samples" in _message(found)
         told = bool(error.get("conflicts")) or mass
