@@ -20,6 +20,7 @@ from lidardesign.config import DensitySettings
 from lidardesign.density.objective.visibility import NoVisibility
 from lidardesign.scenes.scene import Body, Box, Scene, rigid
 from lidardesign.scoring.accuracy.fields import VisibilityCase
+from lidardesign.scoring.accuracy.probes import Probes
 from lidardesign.space import DesignSpace
 
 PLATE_M = 0.005
@@ -49,7 +50,8 @@ def measure(name: str, case: VisibilityCase, points: tuple[int, ...], rounds: in
     )
     rows = []
     for way, target in ways.items():
-        probes = case.probes.first(case.few if way.startswith("quadrature") else len(case.exact))
+        count = case.few if way.startswith("quadrature") else len(case.exact)
+        probes = Probes(case.probes.points[:count], case.probes.log_proposal[:count])
         error, spread = probes.misplaced(target.log_density(probes.points), case.exact[: len(probes.points)])
         rows.append([name, way, error, spread, 1e3 * timings[way].wall_median])
     return rows

@@ -13,6 +13,8 @@ from numba import njit
 
 from lidardesign.scenes.surface import BALL_SLACK, BOX, CAPSULE, CYLINDER, ELLIPSOID, PLANE, SPHERE
 
+BLOCK = 4096  # rays that are looked at together
+
 
 @njit(cache=True, nogil=True, inline="always")
 def row(values, n):  # noqa: ANN001, ANN201
@@ -190,7 +192,8 @@ def _passes(centre, radius, origin, direction, limit):  # noqa: ANN001, ANN202
     along, squared = x * direction[0] + y * direction[1] + z * direction[2], x * x + y * y + z * z
     slack = BALL_SLACK * squared
     reach = radius + math.sqrt(slack)
-    return squared - along * along <= radius * radius + slack and along >= -reach and along - reach <= limit
+    # without a short cut, many rays are tested at once
+    return (squared - along * along <= radius * radius + slack) & (along >= -reach) & (along - reach <= limit)
 
 
 @njit(cache=True, nogil=True)
@@ -204,6 +207,26 @@ def normal_at_range(kind, size, to_body, body, origin, direction, distance):  # 
 
 
 @njit(cache=True, nogil=True)
+def _keep_nearest(shapes, rays, count, passes, best, found) -> None:  # noqa: ANN001
+    """The nearest primitives before `best` (N,) of `count` rays (6, N), body by body: balls of many rays at once."""
+    kinds, sizes, to_body, centres, radii, _ = shapes
+    for b in range(kinds.shape[0]):
+        for n in range(count):
+            origin, direction = (rays[0, n], rays[1, n], rays[2, n]), (rays[3, n], rays[4, n], rays[5, n])
+            passes[n] = _passes(row(centres, b), radii[b], origin, direction, best[n])
+        for n in range(count):
+            if not passes[n]:
+                continue
+            origin, direction = (rays[0, n], rays[1, n], rays[2, n]), (rays[3, n], rays[4, n], rays[5, n])
+            near, far = primitive_roots(
+                kinds[b], row(sizes, b), placed(to_body, b, origin), turned(to_body, b, direction)
+            )
+            value = near if near >= 0.0 else far
+            if value >= 0.0 and value < best[n]:
+                best[n], found[n] = value, b
+
+
+@njit(cache=True, nogil=True)
 def keep_nearer(shapes, origins, directions, limits, ranges, bodies, normals):  # noqa: ANN001, ANN201
     """Replace known hits of rays by nearer ones on primitives.
 
@@ -214,23 +237,24 @@ def keep_nearer(shapes, origins, directions, limits, ranges, bodies, normals):  
         limits: Ends of the rays, shape (N,) [m].
         ranges, bodies, normals: Known hits, updated: shapes (N,), (N,) and (N, 3), normals outward in the world.
     """
-    kinds, sizes, to_body, centres, radii, numbers = shapes
-    for n in range(origins.shape[0]):
-        origin, direction = row(origins, n), row(directions, n)
-        best, found = min(ranges[n], limits[n]), -1
-        for b in range(kinds.shape[0]):
-            if not _passes(row(centres, b), radii[b], origin, direction, best):
+    to_body, numbers, total = shapes[2], shapes[5], origins.shape[0]
+    along_axes, passes = np.empty((6, min(total, BLOCK))), np.empty(min(total, BLOCK), dtype=np.uint8)
+    best, found = np.empty(passes.shape[0]), np.empty(passes.shape[0], dtype=np.int64)
+    for first in range(0, total, BLOCK):
+        count = min(BLOCK, total - first)
+        for n in range(count):
+            for axis in range(3):
+                along_axes[axis, n], along_axes[3 + axis, n] = origins[first + n, axis], directions[first + n, axis]
+            best[n], found[n] = min(ranges[first + n], limits[first + n]), -1
+        _keep_nearest(shapes, along_axes, count, passes, best, found)
+        for n in range(count):
+            b = found[n]
+            if b < 0:
                 continue
-            near, far = primitive_roots(
-                kinds[b], row(sizes, b), placed(to_body, b, origin), turned(to_body, b, direction)
-            )
-            value = near if near >= 0.0 else far
-            if value >= 0.0 and value < best:
-                best, found = value, b
-        if found >= 0:
-            ranges[n], bodies[n] = best, numbers[found]
-            normal, _ = normal_at_range(kinds[found], row(sizes, found), to_body, found, origin, direction, best)
-            normals[n, 0], normals[n, 1], normals[n, 2] = normal
+            origin, direction = row(origins, first + n), row(directions, first + n)
+            ranges[first + n], bodies[first + n] = best[n], numbers[b]
+            (x, y, z), _ = normal_at_range(shapes[0][b], row(shapes[1], b), to_body, b, origin, direction, best[n])
+            normals[first + n, 0], normals[first + n, 1], normals[first + n, 2] = x, y, z
 
 
 @njit(cache=True, nogil=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -196,6 +197,15 @@ def test_rays_on_the_edge_of_their_field_are_inside_whatever_digits_a_file_round
     assert broken(document) == []
     one["field_of_view_rad"] = {"horizontal": horizontal - 1e-4, "vertical": vertical}
     assert broken(document) == ["s0.rays.horizontal_rad"]
+
+
+@pytest.mark.parametrize("turn", [170, 190, 300])
+def test_fields_beyond_a_half_turn_hold_what_they_hold_below_it(turn):
+    wide = replace(SENSORS[0], field_of_view_rad=(math.radians(turn), 1.9))
+    document = design_document(DesignSpec("d", (wide,), "chosen", (Pattern.of(even_rays((wide,), (400,))),)))
+    assert broken(document, {}) == []
+    document["sensors"][0]["field_of_view_rad"]["horizontal"] -= 0.5
+    assert broken(document, {}) == ["s0.rays.horizontal_rad"]
 
 
 VIOLATIONS = [
