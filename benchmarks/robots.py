@@ -62,7 +62,7 @@ CASES = {
     ),
     "gripper arm": Case(
         f"{HAND}/fetch/pick_and_place.xml", "*finger_link",
-        {"world": WORLD, "gripper": ("mount_body=robot0:gripper_link", "metric=seen")}, HAND,
+        {"world": WORLD, "gripper": ("mount_body=robot0:gripper_link", "origin_m=[-0.02,0,0.06]", "metric=seen")}, HAND,
     ),
 }  # fmt: skip
 

@@ -82,7 +82,7 @@ class Selection:
             raise InfeasibleError(
                 f"none of {len(self.rays)} candidate rays tells anything about {scenes} training scenes",
                 where=self.name,
-                hint="let sensors look at the targets: constrain less, or learn longer",
+                hint="let sensors look at the targets: from another place, constrained less, or learn longer",
             )
 
     @phase("choice")
