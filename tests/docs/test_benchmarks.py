@@ -207,6 +207,7 @@ SMALLEST = [
     ("arm", ["--preset", "draft", *SMALL_ARM, "--sensors", "2", "--rays", "40"]),
     ("commands", ROUGH),
     ("constrain", [*FACE, *ROUGH, "--only", "none", "--only", "10 sensors"]),
+    ("effects", [*FACE, "--heads", "2", "--rays", "16", "--many", "100"]),
     ("fields", [*FACE, "--scenes", "2", "--resolution", "24", "--trimesh-points", "50"]),
     ("flow", ["--batch", "64", "--layers", "2", "--bins", "4", "--hidden", "8"]),
     ("frames", ["--robot", "embedded", "--trajectories", "2", "--frames", "12", "--points", "64", "--casters", "6"]),
@@ -217,6 +218,7 @@ SMALLEST = [
     ("baselines", ["--folder", "kept", "--task", "warehouse", "--preset", "draft", *SMALL_WAREHOUSE, "--rays", "6"]),
     ("selection", [*FACE, "--scenes", "4", "8", "--candidates", "100", "200", "--count", "25", "--problems", "2"]),
     ("target", [*FACE, "--scenes", "2", "--batch", "128", "--points", "8", "--resolution", "24"]),
+    ("visibility", [*FACE, "--scenes", "2", "--batch", "64", "--points", "8", "16"]),
     ("warehouse", ["--preset", "draft", *SMALL_WAREHOUSE, "--rays", "4", "--fit-rays", "4", "--at", "0", "0.37"]),
 ]
 
