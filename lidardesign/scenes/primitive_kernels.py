@@ -208,7 +208,14 @@ def normal_at_range(kind, size, to_body, body, origin, direction, distance):  # 
 
 @njit(cache=True, nogil=True)
 def _keep_nearest(shapes, rays, count, passes, best, found) -> None:  # noqa: ANN001
-    """The nearest primitives before `best` (N,) of `count` rays (6, N), body by body: balls of many rays at once."""
+    """Replace `best` (N,) and `found` (N,) of rays (6, N) by nearer primitives, body by body.
+
+    Arguments:
+        shapes: As in `keep_nearer`.
+        rays: Origins and directions by axis, shape (6, N); the first `count` of them are looked at.
+        passes: Room for which rays pass a body's bounding ball, shape (N,).
+        best, found: Ranges of the nearest hits [m] and their bodies, updated.
+    """
     kinds, sizes, to_body, centres, radii, _ = shapes
     for b in range(kinds.shape[0]):
         for n in range(count):
@@ -237,23 +244,24 @@ def keep_nearer(shapes, origins, directions, limits, ranges, bodies, normals):  
         limits: Ends of the rays, shape (N,) [m].
         ranges, bodies, normals: Known hits, updated: shapes (N,), (N,) and (N, 3), normals outward in the world.
     """
-    to_body, numbers, total = shapes[2], shapes[5], origins.shape[0]
-    along_axes, passes = np.empty((6, min(total, BLOCK))), np.empty(min(total, BLOCK), dtype=np.uint8)
-    best, found = np.empty(passes.shape[0]), np.empty(passes.shape[0], dtype=np.int64)
+    kinds, sizes, to_body, _, _, numbers = shapes
+    total, size = origins.shape[0], min(origins.shape[0], BLOCK)
+    by_axis, passes = np.empty((6, size)), np.empty(size, dtype=np.uint8)
+    best, found = np.empty(size), np.empty(size, dtype=np.int64)
     for first in range(0, total, BLOCK):
         count = min(BLOCK, total - first)
         for n in range(count):
             for axis in range(3):
-                along_axes[axis, n], along_axes[3 + axis, n] = origins[first + n, axis], directions[first + n, axis]
+                by_axis[axis, n], by_axis[3 + axis, n] = origins[first + n, axis], directions[first + n, axis]
             best[n], found[n] = min(ranges[first + n], limits[first + n]), -1
-        _keep_nearest(shapes, along_axes, count, passes, best, found)
+        _keep_nearest(shapes, by_axis, count, passes, best, found)
         for n in range(count):
             b = found[n]
             if b < 0:
                 continue
             origin, direction = row(origins, first + n), row(directions, first + n)
             ranges[first + n], bodies[first + n] = best[n], numbers[b]
-            (x, y, z), _ = normal_at_range(shapes[0][b], row(shapes[1], b), to_body, b, origin, direction, best[n])
+            (x, y, z), _ = normal_at_range(kinds[b], row(sizes, b), to_body, b, origin, direction, best[n])
             normals[first + n, 0], normals[first + n, 1], normals[first + n, 2] = x, y, z
 
 
