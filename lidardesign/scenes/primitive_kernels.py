@@ -212,7 +212,8 @@ def _keep_nearest(shapes, rays, count, passes, best, found) -> None:  # noqa: AN
 
     Arguments:
         shapes: As in `keep_nearer`.
-        rays: Origins and directions by axis, shape (6, N); the first `count` of them are looked at.
+        rays: Origins and directions by axis, shape (6, N).
+        count: How many of them are looked at.
         passes: Room for which rays pass a body's bounding ball, shape (N,).
         best, found: Ranges of the nearest hits [m] and their bodies, updated.
     """
