@@ -297,12 +297,11 @@ def _astray(pattern: Mapping[str, Any], sensors: Sequence[Mapping[str, Any]], le
         sideways = np.hypot(*across)
         # true angles from the boresight, along the field's two axes
         angle = np.arctan2(sideways, forward) / np.where(sideways > 0, sideways, 1.0)
-        ways = [[angle * part for part in across]]
-        if view["horizontal"] > math.pi:
-            # sensors that turn state turns and heights, which differ from these behind the boresight
-            ways.append([np.arctan2(across[0], forward), np.arcsin(np.clip(across[1], -1.0, 1.0))])
-        widths = [[float(np.abs(part).max(initial=0.0)) * 2 for part in way] for way in ways]
-        most = min(widths, key=lambda width: max(value - view[axis] for axis, value in zip(ANGLES, width, strict=True)))
+        parted = [angle * part for part in across]
+        if view["horizontal"] >= 2 * math.pi - AGREEMENT:
+            # of a sensor that turns all around, turns and heights say where rays are
+            parted = [np.arctan2(across[0], forward), np.arcsin(np.clip(across[1], -1.0, 1.0))]
+        most = [float(np.abs(part).max(initial=0.0)) * 2 for part in parted]
         name = str(sensor.get("name", index))
         checks = [
             ConstraintCheck(f"{name}.rays.{axis}_rad", view[axis], value, value <= view[axis] + AGREEMENT)
