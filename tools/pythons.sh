@@ -7,3 +7,11 @@ found_python() {
     [ -n "$python" ] && "$python" -c "" 2> /dev/null || { echo "Python $1 is not here" >&2; return 1; }
     echo "$python"
 }
+
+# `room_for_python VERSION` says that there is no room for an environment, and fails: PyTorch for some Pythons brings its
+# libraries for graphics cards, 7 GB while it is installed.
+room_for_python() {
+    local free_gb
+    free_gb="$(df -Pk . | awk 'END { print int($4 / 1048576) }')"
+    [ "$free_gb" -ge 8 ] || { echo "Python $1 needs 8 GB, $free_gb are free: left out" >&2; return 1; }
+}
