@@ -724,7 +724,6 @@ EXCLUDING = [
     ("evaluate run --baseline none --fail-unless-better greedy", "--baseline", "--fail-unless-better"),
     ("learn flatland --tolerance 0.1 --set learning.misplaced=0.2", "learning.misplaced", "--tolerance"),
 ]
-# Those whose message names one of them alone.
 
 
 @pytest.mark.parametrize(("line", "one", "other"), EXCLUDING)

@@ -17,6 +17,7 @@ from lidardesign_tasks.importance import (
 from lidardesign_tasks.meshes import MeshesConfig, MeshesTask
 from lidardesign_tasks.poses import rotation_matrix
 from pydantic import ValidationError
+from support.meshes import save
 
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.scenes.mesh_files import Painted, check_mesh, load_mesh
@@ -31,17 +32,6 @@ def ball(radius=1.0, subdivisions=2):
 
 def arrays(mesh):
     return np.asarray(mesh.vertices), np.asarray(mesh.faces)
-
-
-def save(mesh, path):
-    """A mesh as a file of its suffix's format, with the files beside it that gltf has."""
-    content = mesh.export(file_type=path.suffix[1:])
-    if isinstance(content, dict):
-        for name in content.keys() - {"model.gltf"}:
-            path.with_name(name).write_bytes(content[name])
-        content = content["model.gltf"]
-    path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    return path
 
 
 def painted_ball(grey):
