@@ -118,9 +118,9 @@ soak: soak-benchmarks soak-runs soak-seeds soak-kills fuzz mutation
 soak-benchmarks: $(BIN)/.dev
 	$(BIN)/python -m pytest -m long tests/docs
 
-# 300 runs of random configurations, some 120 of them whole: no fault, every constraint kept, the same bytes when done again
+# 520 runs of random configurations, some 200 of them whole: no fault, every constraint kept, the same bytes when done again
 soak-runs: $(BIN)/.dev
-	$(LONG) benchmarks/soak/runs.py --amount $(or $(AMOUNT),300)
+	$(LONG) benchmarks/soak/runs.py --amount $(or $(AMOUNT),520)
 
 # The face and the arm at draft and standard from 20 seeds each: every one learns well enough
 soak-seeds: $(BIN)/.dev

@@ -202,19 +202,16 @@ def _evaluate_options(generator: np.random.Generator, layout: str, *, reach_m: f
 
 
 POINTS = 20_000
-# Where every ray passes the targets further away than this, learning may say that none reaches them.
-NEAR_SIGMAS = 1.0
 
 
-def share_near_targets(plan: RunPlan) -> float:
-    """The share of even design points whose scene point lies near a target of any training scene."""
+def share_in_targets(plan: RunPlan) -> float:
+    """The share of even design points whose scene point lies in a target of any training scene: rays reach it."""
     space = DesignSpace.from_dict({"condition": (), **plan.config["space"]})
     config = ScaledFlatlandConfig.model_validate(plan.config["task"])
     scenes = ScaledFlatlandTask().scenes(config, "train", plan.seed, space)
     points = observed_point(space.sample(POINTS, random_generator(plan.seed, "soak", "sight")))
-    near_m = NEAR_SIGMAS * plan.config["density"]["sigma_m"]
     targets = [body for scene in scenes for body in scene.bodies if body.is_target]
-    return float(np.any([np.abs(_signed_distance(body, points)) < near_m for body in targets], axis=0).mean())
+    return float(np.any([_signed_distance(body, points) < 0 for body in targets], axis=0).mean())
 
 
 def _signed_distance(body: Body, points: np.ndarray) -> np.ndarray:

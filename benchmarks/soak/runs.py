@@ -4,7 +4,7 @@ Each learns, fits, constrains and evaluates through the program's own command li
 bounds must be kept, tight ones kept or refused with what stands against them, contradictions refused. A density may be
 too rough to fit to, also within bounds or for a baseline (exit 3, or 4 for so many sensors), and a design space may see
 no target (exit 3).
-`pytest -m long -s -p benchmarks.soak.long_runs benchmarks/soak/runs.py --amount 300 -k '[SEED]'` does one again and
+`pytest -m long -s -p benchmarks.soak.long_runs benchmarks/soak/runs.py --amount 520 -k '[SEED]'` does one again and
 shows its configuration.
 """
 
@@ -29,7 +29,7 @@ from support.docs_session import in_process
 from benchmarks.soak.attempts import not_finite
 from benchmarks.soak.limits import Rules, bounds_around, contradictions
 from benchmarks.soak.long_runs import amount, ended_after
-from benchmarks.soak.plans import RunPlan, random_plan, share_near_targets
+from benchmarks.soak.plans import RunPlan, random_plan, share_in_targets
 from benchmarks.soak.scaled_flatland import NAME, offer
 from lidardesign.constraints.check import check_design
 from lidardesign.run.yaml import dump_yaml, load_yaml
@@ -47,8 +47,8 @@ TOO_ROUGH_WORDS = re.compile(f"the density is too rough|samples count as only|ef
 NOTHING_SEEN_WORDS = "no ray of the design space reaches a target surface"
 # Outcomes: all four commands did their work; the two refusals that learning may end with.
 WHOLE, ROUGH, BLIND = "whole", "density too rough", "nothing in sight"
-# A run may say that it sees nothing where less of its space than this is near any target.
-MOST_NEAR = 1e-3
+# A run may say that it sees nothing where less of its space than this lies in a target.
+MOST_REACHED = 1e-3
 # What differs between two runs of one seed: times (also `planning_seconds`) and memory.
 UNREPEATABLE = ("seconds", "timings", "peak_memory_bytes")
 FILES = ("flow.safetensors", "samples.npz")
@@ -110,8 +110,8 @@ class _Doing:
         options = ("--config", "asked.yaml", "--preset", "draft", "--out", "run", "--seed", str(self.plan.seed))
         code, found = self._call("learn", "", NAME, *options)
         if NOTHING_SEEN_WORDS in _message(found):
-            share = share_near_targets(self.plan)
-            self._expect(share < MOST_NEAR, f"learn: nothing is seen, but {share:.2%} of the space is near a target")
+            share = share_in_targets(self.plan)
+            self._expect(share < MOST_REACHED, f"learn: nothing is seen, but {share:.2%} of the space is in a target")
             self._stop(BLIND)
         self._expect(code == DONE, f"learn ended with {code}: {_message(found)}", stop=True)
         for key in ("ess", "coverage", "misplaced"):
