@@ -23,7 +23,7 @@ from lidardesign.run.manifest import read_manifest, verify, write_recorded
 from lidardesign.run.validation import Override, anchor_paths, apply_override, check_model, is_name, parse_overrides
 from lidardesign.run.yaml import Document, KeyPath, dump_yaml, leaves, load_yaml, merged
 from lidardesign.space import DIMENSIONS, FARTHEST_M, SHORTEST_M, DesignSpace
-from lidardesign.task import Task, TaskConfig
+from lidardesign.task import Task, TaskConfig, moved_files
 
 Visibility = Literal["auto", "raycast", "quadrature", "off"]
 Preset = Literal["draft", "standard", "fine"]
@@ -250,7 +250,7 @@ def with_task_settings(task: Task, config: RunConfig, overrides: Sequence[str], 
     """A run's configuration with other values of the task's own keys, to evaluate its designs with.
 
     Raises:
-        ConfigError: At the option; also where the value would change the design space.
+        ConfigError: At the option; also where the value would change the design space, or what is held out.
     """
     layers = _Layers({section: {} for section in SECTIONS})
     layers.merge("task", config.task.model_dump(mode="json"), FILE_NAME)
@@ -265,9 +265,12 @@ def with_task_settings(task: Task, config: RunConfig, overrides: Sequence[str], 
     judged = check_model(task.Config, layers.values["task"], layers.origin, "task")
     with plugin_guard(task.name):
         same = task.space(judged).as_dict() == task.space(config.task).as_dict()
-    if not same:
+        moved = moved_files(config.task, judged)
+    if moved or not same:
         raise ConfigError(
-            "changes the design space that the run was learned in",
+            f"changes which files are held out: {', '.join(moved)}"
+            if moved
+            else "changes the design space that the run was learned in",
             where=f"{option} " + ", ".join(overrides),
             hint=f"learn another run with it: lidardesign learn {task.name} --set KEY=VALUE",
         )

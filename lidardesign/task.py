@@ -60,11 +60,22 @@ class FolderConfig(TaskConfig):
 
     def twin_notes(self) -> list[str]:
         """A note that names held-out files that are equal to files that are learned from; empty without any."""
-        files = {Path(path): digest for path, digest in sorted(self.inputs.items()) if self.reads(Path(path))}
-        held = self.held_out(list(files))
-        learned = {digest: path.name for path, digest in files.items() if path not in held}
-        twins = [f"{path.name} and {learned[files[path]]}" for path in held if files[path] in learned]
+        learned, held = self.sides()
+        twins = [f"{held[digest]} and {learned[digest]}" for digest in held if digest in learned]
         return [f"equal files are held out and learned from, so scores flatter: {'; '.join(twins)}"] if twins else []
+
+    def sides(self) -> tuple[dict[str, str], dict[str, str]]:
+        """Names of the files that are learned from, and of those that are held out, by their SHA-256.
+
+        The recorded files, and those that are in folders of which none is recorded.
+        """
+        files = {Path(path): digest for path, digest in sorted(self.inputs.items()) if self.reads(Path(path))}
+        for folder in {getattr(self, key) for key in self.folders} - {None, *(path.parent for path in files)}:
+            present = filter(self.reads, sorted(Path(folder).iterdir())) if Path(folder).is_dir() else ()
+            files |= {path: _digest(path, path.stat().st_mtime_ns, path.stat().st_size) for path in present}
+        held_out = self.held_out(list(files))
+        learned = {digest: path.name for path, digest in files.items() if path not in held_out}
+        return learned, {files[path]: path.name for path in held_out}
 
     def learned_files(self, files: Sequence[Path]) -> dict[str, Path | None]:
         """Files of a folder by the names that they had when the run was learned, in that order; None for missing ones.
@@ -96,6 +107,15 @@ class FolderConfig(TaskConfig):
             hint = "put them back, or learn again"
             raise DataError("holds none of the files that the run was learned from", where=str(folder), hint=hint)
         return found
+
+
+def moved_files(first: BaseModel, second: BaseModel) -> list[str]:
+    """Names of files that are held out with one configuration of a task and learned from with the other."""
+    if not (isinstance(first, FolderConfig) and isinstance(second, FolderConfig)):
+        return []
+    (learned, held), (learned_now, held_now) = first.sides(), second.sides()
+    moved = (learned.keys() & held_now.keys() - held.keys()) | (held.keys() & learned_now.keys() - learned.keys())
+    return sorted((learned | held)[digest] for digest in moved)
 
 
 @lru_cache(maxsize=4096)

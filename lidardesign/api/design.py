@@ -36,7 +36,7 @@ from lidardesign.scenes.scene import Scene
 from lidardesign.sensors.compare import outside_space
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import design_text, save_design
-from lidardesign.task import scoring_settings
+from lidardesign.task import moved_files, scoring_settings
 from lidardesign.workers import check_workers, opened_workers
 
 if TYPE_CHECKING:
@@ -478,6 +478,8 @@ def scoring_run(designs: Sequence[Design], judge: RunFolder | None, notes: Notes
         if design.run is not None and _settings(design.run) != _settings(judge):
             outside = outside_space(design.specification, judge.config.space)
             there = f"; {outside} its design space" if outside else ""
+            moved = ", ".join(moved_files(design.run.config.task, judge.config.task))
+            there += f"; held out in one of these runs and learned from in the other: {moved}" if moved else ""
             notes(f"{design.name} of {design.run.folder} is scored in the scenes of {judge.folder}{there}")
     return judge
 

@@ -22,7 +22,7 @@ from lidardesign.run.manifest import DAMAGED_HINT, read_manifest
 from lidardesign.run.outputs import CACHE
 from lidardesign.run_folder import MANIFEST, Notes, RunFolder, log_note
 from lidardesign.sensors.sensor import MOST_RAYS
-from lidardesign.task import mount_of
+from lidardesign.task import Metric, mount_of
 
 if TYPE_CHECKING:
     from lidardesign.api.scores import Scores
@@ -218,6 +218,10 @@ class Run(RunFolder):
         """
         manifest, config, at_work = read_manifest(self.folder), self.config, writer(self.folder)
         learned = manifest.get("learn")
+        try:
+            metric = self.metric
+        except LidardesignError:  # of a task whose files are elsewhere
+            metric = self.task.metric
         quality = None if learned is None else self.quality
         designs = [_design_entry(path, manifest) for path in self.design_paths()]
         cache = self.folder / CACHE
@@ -226,7 +230,7 @@ class Run(RunFolder):
             "task": config.task_name,
             "preset": config.preset,
             "seed": config.seed,
-            "metric": {"name": self.metric.name, "unit": self.metric.unit, "better": self.metric.better},
+            "metric": {"name": metric.name, "unit": metric.unit, "better": metric.better},
             "quality": None if quality is None else {name: getattr(quality, name) for name in FIGURES},
             "verdict": None if quality is None else quality.verdict,
             "advice": None if quality is None else quality.advice(config.preset),
@@ -234,7 +238,7 @@ class Run(RunFolder):
             "designs": designs,
             "cache": {"path": str(cache), "bytes": cache.stat().st_size} if cache.is_file() else None,
             "writer": at_work,
-            "next": [] if learned is None and at_work else self._next_commands(designs, finished=learned is not None),
+            "next": [] if learned is None and at_work else self._next_commands(designs, learned is not None, metric),
         }
 
     @names_arguments
@@ -280,7 +284,7 @@ class Run(RunFolder):
         origin = {**design.provenance, "task": self.task.name, "run": origin}
         return Design(replace(design, name=name, mount=mount, provenance=origin), self)
 
-    def _next_commands(self, designs: Sequence[Mapping[str, Any]], *, finished: bool) -> list[str]:
+    def _next_commands(self, designs: Sequence[Mapping[str, Any]], finished: bool, metric: Metric) -> list[str]:
         """Command lines of the next steps."""
         run = quote(str(self.folder))
         if not finished:
@@ -290,7 +294,7 @@ class Run(RunFolder):
         evaluating = [f"lidardesign evaluate {run} --report report.html"] if unscored else []
         if not scored:
             return evaluating or [f"lidardesign fit {run}"]
-        best = (min if self.metric.better == "lower" else max)(scored, key=lambda entry: entry["score"]["value"])
+        best = (min if metric.better == "lower" else max)(scored, key=lambda entry: entry["score"]["value"])
         rays = best["score"]["rays"]
         return [
             *evaluating,

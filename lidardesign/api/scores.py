@@ -50,7 +50,7 @@ class ScoreOptions:
     """A user's choices for an evaluation.
 
     Arguments:
-        rays: Numbers of rays per frame; the task's by default, and those of fixed patterns.
+        rays: Numbers of rays per frame; the task's by default, and the designs'.
         baselines: Further baselines beside uniform, random, bounding, silhouette and greedy, by name; ["none"] leaves
             out all of them.
         seed: Seed of all random numbers; the run's by default.

@@ -201,12 +201,8 @@ def _part(progress: Progress | None, number: int, parts: int) -> Progress | None
 def _check_runs(runs: Sequence[RunFolder]) -> None:
     if len(runs) < FEWEST_RUNS:
         raise ConfigError(f"{len(runs)} run", where="runs", allowed=f"{FEWEST_RUNS} or more that differ in their seed")
-    places: dict[Path, RunFolder] = {}
     seeds: dict[int, RunFolder] = {}
     for run in runs:
-        if run.folder.resolve() in places:
-            raise ConfigError(f"{run.folder} is named twice", where="runs", allowed="each run once")
-        places[run.folder.resolve()] = run
         other = _other_setting(runs[0], run)
         if other is not None:
             raise ConfigError(

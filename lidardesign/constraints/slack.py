@@ -103,7 +103,7 @@ def broken_notes(name: str, checks: Iterable[ConstraintCheck]) -> list[str]:
     more = f" and {len(broken) - 1} more" if len(broken) > 1 else ""
     return [
         f"{name} breaks {one.name}{more}: it has {_said(one.value)}, allowed is {_said(one.bound)}; "
-        f"lidardesign show {name} lists all"
+        "lidardesign show DESIGN lists all"
         for one in broken[:1]
     ]
 

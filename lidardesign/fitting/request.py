@@ -396,9 +396,11 @@ def _gates(asked: str | None, base: DesignSpec | None, space: DesignSpace, layou
 def _level(asked: float | None, base: DesignSpec | None, run: RunFolder, layout: LayoutName) -> float:
     if asked is not None:
         return asked
-    if base is not None and base.layout == layout:
+    usual = {True: CHOSEN_LEVEL, False: run.task.defaults.level}
+    # a level that somebody asked for is kept in another layout too
+    if base is not None and (base.layout == layout or base.level != usual[base.layout == "chosen"]):
         return base.level
-    return CHOSEN_LEVEL if layout == "chosen" else run.task.defaults.level
+    return usual[layout == "chosen"]
 
 
 def _world(options: FitOptions, base: DesignSpec | None) -> tuple[str | None, tuple[str, ...]]:

@@ -37,7 +37,7 @@ from typing import Any
 
 import numpy as np
 
-from lidardesign.errors import ConfigError
+from lidardesign.errors import ConfigError, check_number
 from lidardesign.formats.mounts import (
     EvenGrid,
     Mount,
@@ -76,10 +76,7 @@ def write_carla(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Ban
         ConfigError: A frame rate that Unreal's frames do not have; at those, CARLA's whole numbers of points per second
             are the rays of a frame.
     """
-    if not SLOWEST_HZ <= rate_hz <= FASTEST_HZ:
-        raise ConfigError(
-            f"{rate_hz:g}", where="--rate-hz", allowed=f"{SLOWEST_HZ:g} to {FASTEST_HZ:g} Hz, the frames of CARLA"
-        )
+    check_number(rate_hz, "--rate-hz", SLOWEST_HZ, FASTEST_HZ)
     design, rays, mounted = channel_mounts(design, rays)
     document = {
         "design": design.name,

@@ -254,7 +254,7 @@ class Part:
         return None if frame is None else frame * BITS_PER_BYTE * self.rate_hz / BITS_PER_MEGABIT
 
     def under(self, *, reflectance_percent: float | None = None, illuminance_klux: float | None = None) -> Part:
-        """The part with the largest range that its sources state for given conditions.
+        """The part with the largest range that its sources state for given conditions; without any, itself.
 
         A statement holds for targets at least as bright and ambient light at most as strong as its own. One that lacks
         a given condition is left out.
@@ -262,6 +262,8 @@ class Part:
         Raises:
             ConfigError: No source states a range under such conditions.
         """
+        if reflectance_percent is None and illuminance_klux is None:
+            return self
         fits = [
             one
             for one in self.figures["far_m"]

@@ -65,6 +65,7 @@ def write_atomic(path: Path, content: bytes | str) -> None:
 
     Raises:
         DataError: The disk is full, the folder is read-only, or anything else the system reports.
+        BrokenPipeError: The reader of a pipe ended.
     """
     path = Path(path)
     if path.is_symlink() and (path.is_file() or not path.exists()):
@@ -97,6 +98,8 @@ def write_atomic(path: Path, content: bytes | str) -> None:
                     os.fsync(descriptor)
                 finally:
                     os.close(descriptor)
+    except BrokenPipeError:
+        raise
     except OSError as error:
         raise _unwritten(path, error) from error
 

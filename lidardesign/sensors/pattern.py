@@ -214,9 +214,10 @@ def _row_count(horizontal_rad: float, vertical_rad: float, count: int) -> int:
     """The number of rows whose cells are closest to square by ratio; 0 for a field without height."""
     if horizontal_rad <= 0:
         return count * (vertical_rad > 0)
-    ideal = min(count, math.sqrt(count * (vertical_rad / horizontal_rad)))
-    fewer = math.floor(ideal)
-    return fewer if ideal**2 <= fewer * (fewer + 1) else fewer + 1
+    squared = count * min(count, vertical_rad / horizontal_rad)
+    fewer = math.floor(math.sqrt(squared))
+    # as the square of the root may round, two rays in a square field would be above each other
+    return fewer if squared <= fewer * (fewer + 1) else fewer + 1
 
 
 def low_discrepancy(count: int, axes: int) -> np.ndarray:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,7 +15,7 @@ from support.meshes import write_ball
 import lidardesign as ld
 from lidardesign.api.learn import LearnOptions, LearnRequest
 from lidardesign.config import with_task_settings
-from lidardesign.errors import DataError
+from lidardesign.errors import ConfigError, DataError
 from lidardesign.run.manifest import read_manifest
 from lidardesign.run_folder import RunFolder, input_hashes
 
@@ -98,10 +97,14 @@ def test_scenes_are_those_that_were_learned_and_newcomers_are_named(place, chang
     assert named is None or notes[0].startswith(f"{named}: added after")
 
 
-def test_as_long_as_nothing_changed_scenes_are_those_of_the_folder(place):
-    run = RunFolder.open(place / "run")
-    plain = replace(run, config=replace(run.config, task=run.config.task.model_copy(update={"inputs": {}})))
-    assert (splits(plain), plain.metric) == (splits(run), run.metric)
+def test_no_setting_moves_a_mesh_between_learning_and_scoring(place):
+    run, copy = ld.open_run(place / "run"), shutil.copytree(place / "meshes", place / "copy")
+    elsewhere = run.with_settings([f"folder={copy}"])
+    assert (splits(elsewhere), elsewhere.metric) == (splits(run), run.metric)
+    (copy / "c.stl").unlink()
+    for setting in ("test_share=0.2", "test_share=0.8", f"folder={copy}"):
+        with pytest.raises(ConfigError, match="changes which files are held out"):
+            run.with_settings([setting])
 
 
 def test_what_went_or_changed_moves_no_other_mesh(place):

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from support import references
 from support.fits import design_of, fitted
+from support.scoring import MissTask
 
 from lidardesign.samples import Samples
 from lidardesign.scenes.scene import Body, Capsule, Mesh, Scene, Sphere, rigid
 from lidardesign.scoring.evaluation.request import EvaluationRequest
 from lidardesign.scoring.evaluation.score import evaluate
 from lidardesign.space import DesignSpace, aim
-from lidardesign.task import Defaults, Metric, Score, TaskConfig
+from lidardesign.task import Metric, Score, TaskConfig
 
 QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 CEILING = DesignSpace((-0.6, -0.5, 1.0, 0.0, -math.pi / 2, 0.2), (0.6, 0.7, 1.0, 2 * math.pi, -0.9, 1.3))
@@ -23,15 +24,10 @@ RADIUS_M = 0.12
 FRAMES = 6
 
 
-class HitTask:
+class RangeTask(MissTask):
     """Millimetres of range that come back from the target, a figure that every single return changes."""
 
-    name = "hits"
-    summary = "ranges of returns on the target"
-    api_version = 1
-    Config = TaskConfig
     metric = Metric("range", "mm", "higher", worst=0.0, tolerance=1.0)
-    defaults = Defaults()
 
     def score(self, scene, returns):
         ranges = np.concatenate([one.range_m[one.returned & (one.body == 0)] for one in returns])
@@ -62,7 +58,7 @@ def from_the_ceiling(count=6000, seed=0):
 
 
 def request(designs, scenes, space=CEILING, rays=(40,), **changes):
-    values = {"task": HitTask(), "config": TaskConfig(), "seed": 0, "baselines": (), "test": scenes}
+    values = {"task": RangeTask(), "config": TaskConfig(), "seed": 0, "baselines": (), "test": scenes}
     return EvaluationRequest(**{**values, "designs": designs, "space": space, "rays": rays, **changes})
 
 

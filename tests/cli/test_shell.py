@@ -45,13 +45,8 @@ def flat(fitted, tmp_path):
 def test_rays_go_to_a_device_whole(lidardesign, flat):
     design = flat / "designs" / "fit.yaml"
     assert lidardesign("export", design, "--format", "csv", "--out", "rays.csv").code == 0
-    done = program_output("export", design, "--format", "csv", "--out", "/dev/stdout")
-    assert done == Path("rays.csv").read_text()
-
-
-def program_output(*arguments):
-    command = [sys.executable, "-m", "lidardesign", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    command = [sys.executable, "-m", "lidardesign", "export", design, "--format", "csv", "--out", "/dev/stdout"]
+    assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == Path("rays.csv").read_text()
 
 
 def on_terminal(*arguments, **environment):

@@ -120,7 +120,13 @@ def test_two_designs_differ_in_what_is_shown(call, run):
     assert found["sensors"] == [difference(*pair) for pair in pairs]
     assert "gate.width_m.max" in call("show", few, tight).out
     assert [design["bandwidth"]["rays"] for design in call("show", few, more, "--json").json["designs"]] == [8, 12]
-    assert call("show", few, few, "--json").json["constraints"] == {}
+    fixed, turned = few.with_name("fixed.yaml"), few.with_name("turned.yaml")
+    for one, step in ((fixed, 1), (turned, -1)):
+        design = load_design(more)
+        pattern = Pattern.of(design.rays().subset(slice(None, None, step)))
+        save_design(replace(design, layout="fixed", patterns=(pattern,)), one)
+    found = [call("show", fixed, other, "--json").json for other in (fixed, turned)]
+    assert [(one["constraints"], one["rays_differ"]) for one in found] == [({}, False), ({}, True)]
     assert call("show", few, run).code == 3
 
 

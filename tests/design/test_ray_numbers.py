@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -34,6 +35,7 @@ def test_a_pattern_is_left_out_beyond_its_rays_and_the_others_are_not():
     designs = [pattern("few", 7), pattern("more", 20), pattern("any", 1, "even")]
     assert usual_numbers(designs, (10, 30)) == [7, 10, 20, 30]
     assert usual_numbers(designs[2:], (10, 30)) == [10, 30]
+    assert usual_numbers([replace(designs[2], constraints={"budget": {"rays": 17}})], (10, 30)) == [10, 17, 30]
     assert usual_numbers([pattern("large", 500)], (10, 30)) == [500]
     assert usual_numbers([pattern("large", 500), designs[2]], (10, 30)) == [10, 30, 500]
     assert fired_numbers(designs, (30, 7, 30)) == [30, 7]

@@ -106,6 +106,7 @@ def test_a_grid_has_exactly_its_rays_spread_over_rows_that_differ_by_one_at_most
 @given(across=st.integers(1, 25), up=st.integers(1, 25))
 def test_a_budget_in_the_proportion_of_the_field_is_the_regular_grid_with_no_ray_on_the_edge(across, up):
     assert grid_rows(0.03 * across, 0.03 * up, across * up).tolist() == [across] * up
+    assert len(grid_rows(0.03 * up, 0.03 * up, up * (up + 1))) == up  # as square as a row more, which is not added
     centres = np.meshgrid((np.arange(across) + 0.5) - across / 2, (np.arange(up) + 0.5) - up / 2)
     expected = 0.03 * np.stack([axis.ravel() for axis in centres], axis=1)
     np.testing.assert_allclose(grid_tangent(0.03 * across, 0.03 * up, across * up), expected, atol=1e-15)

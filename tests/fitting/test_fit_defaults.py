@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -70,6 +71,7 @@ class TestWhatIsLeftOpen:
         again = resolved(made, base)
         assert (again.layout, again.sensors, again.rays) == (layout, 2, 12)
         assert (again.channels, again.level) == ((1, again.level) if layout == "spinning" else (None, 0.9))
+        assert resolved(made, replace(base, level=0.8), layout="even" if layout == "chosen" else "chosen").level == 0.8
         assert resolved(made, base, constraints={"sensors": {"min": 3}}).sensors == 3
         assert resolved(made, base, constraints={"sensors": {"max": 1}}).sensors == 1
 

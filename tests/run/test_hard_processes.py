@@ -178,8 +178,11 @@ CLOSED = "import os; os.close({}); os.close({}); "
 )
 class TestStreamsLocalesAndSignals:
     def test_a_closed_pipe_ends_quietly(self, tmp_path):
-        for arguments in (["tasks", "show", "flatland", "--json"], ["--help"]):
+        (tmp_path / "rays.csv").write_text("azimuth_rad,elevation_rad,gate_end_m\n" + 9000 * "0.1,0.1,1\n")
+        export = ["export", "rays.csv", "--format", "csv", "--out", "/dev/stdout", "--quiet"]
+        for arguments, read in ((["tasks", "show", "flatland", "--json"], 0), (["--help"], 0), (export, 1)):
             process = program(*arguments, cwd=tmp_path)
+            process.stdout.read(read)
             process.stdout.close()
             assert process.wait() == 141
             assert process.stderr.read() == b""

@@ -39,6 +39,8 @@ Reflectance = Annotated[
     typer.Option(
         "--reflectance",
         metavar="PERCENT",
+        min=0.01,
+        max=100,
         help="Ranges that sources state for targets of this reflectance.",
         show_default=False,
     ),
@@ -46,7 +48,12 @@ Reflectance = Annotated[
 Klux = Annotated[
     float | None,
     typer.Option(
-        "--klux", metavar="KLUX", help="Ranges that sources state for this ambient light.", show_default=False
+        "--klux",
+        metavar="KLUX",
+        min=0,
+        max=1000,
+        help="Ranges that sources state for this ambient light.",
+        show_default=False,
     ),
 ]
 
@@ -74,11 +81,10 @@ def list_(
         with phase("libraries"):
             from lidardesign.parts.catalogue import load_library
 
-        _check_conditions(reflectance, klux)
         parts, vouched = load_library(own or ()).every_mode(), []
         for part in parts:
             with contextlib.suppress(ConfigError):  # no source states a range under such conditions
-                vouched.append(_under(part, reflectance, klux))
+                vouched.append(part.under(reflectance_percent=reflectance, illuminance_klux=klux))
         left_out = len(parts) - len(vouched)
         entries = {"parts": [part_entry(part) for part in vouched], "left_out": left_out}
         output.result(entries, lambda rich: show_parts(vouched, rich), show_costs=False)
@@ -104,14 +110,21 @@ def show(
     ] = None,
     azimuth: Annotated[
         float | None,
-        typer.Option("--azimuth-deg", metavar="DEG", help="Azimuth of its forward axis.", show_default="0"),
+        typer.Option(
+            "--azimuth-deg", metavar="DEG", min=-360, max=360, help="Azimuth of its forward axis.", show_default="0"
+        ),
     ] = None,
     elevation: Annotated[
         float | None,
-        typer.Option("--elevation-deg", metavar="DEG", help="Elevation of its forward axis.", show_default="0"),
+        typer.Option(
+            "--elevation-deg", metavar="DEG", min=-90, max=90, help="Elevation of its forward axis.", show_default="0"
+        ),
     ] = None,
     roll: Annotated[
-        float | None, typer.Option("--roll-deg", metavar="DEG", help="Roll about its forward axis.", show_default="0")
+        float | None,
+        typer.Option(
+            "--roll-deg", metavar="DEG", min=-360, max=360, help="Roll about its forward axis.", show_default="0"
+        ),
     ] = None,
     rays: Annotated[
         int | None,
@@ -142,8 +155,7 @@ def show(
             from lidardesign.parts.catalogue import find_part
             from lidardesign.sensors.design_file import MOST_FILE_RAYS, save_design
 
-        _check_conditions(reflectance, klux)
-        part = _under(find_part(name, own or ()), reflectance, klux)
+        part = find_part(name, own or ()).under(reflectance_percent=reflectance, illuminance_klux=klux)
         document = part_document(part)
         given = {
             "--at-origin": at_origin, "--azimuth-deg": azimuth, "--elevation-deg": elevation, "--roll-deg": roll,
@@ -163,25 +175,12 @@ def show(
                 save_design(design, out)
         elif useless := [option for option, value in given.items() if value is not None]:
             raise ConfigError("says how a design is made", where=useless[0], hint="--out FILE.yaml writes one")
-        output.result(document, lambda rich: show_part(part, document, rich), show_costs=False)
-
-
-def _check_conditions(reflectance: float | None, klux: float | None) -> None:
-    if reflectance is not None and not 0 < reflectance <= 100:
-        raise ConfigError(f"found {reflectance:g}", where="--reflectance", allowed="a percentage above 0, at most 100")
-    if klux is not None and not 0 <= klux <= 1000:
-        raise ConfigError(f"found {klux:g}", where="--klux", allowed="0 (darkness) to 1000; sunlight is about 100")
-
-
-def _under(part: Part, reflectance: float | None, klux: float | None) -> Part:
-    """The part with its range under the conditions that are given.
-
-    Raises:
-        ConfigError: No source states one.
-    """
-    if reflectance is None and klux is None:
-        return part
-    return part.under(reflectance_percent=reflectance, illuminance_klux=klux)
+        output.result(
+            document,
+            lambda rich: show_part(part, document, rich),
+            files=None if out is None else {f"{part.name}, {document['design_rays']} rays": out},
+            show_costs=False,
+        )
 
 
 def _placed(part: Part, given: dict[str, Any], name: str, output: Output) -> DesignSpec:
@@ -197,11 +196,6 @@ def _placed(part: Part, given: dict[str, Any], name: str, output: Output) -> Des
     needed = number or (1 if count is None else parts_for(part, count))
     if needed == 1 and given["--arrange"] is not None:
         raise ConfigError("is for several parts", where="--arrange", hint="--parts N")
-    degrees = {option: given[option] or 0.0 for option in ("--azimuth-deg", "--elevation-deg", "--roll-deg")}
-    for option, value in degrees.items():
-        most = 90 if option == "--elevation-deg" else 360
-        if not abs(value) <= most:
-            raise ConfigError(f"found {value:g}", where=option, allowed=f"-{most} to {most} degrees")
     text = given["--at-origin"]
     try:
         origin = np.array([plain_number(item) for item in (text or "0,0,0").split(",")])
@@ -210,7 +204,7 @@ def _placed(part: Part, given: dict[str, Any], name: str, output: Output) -> Des
     if origin.shape != (3,) or not (np.abs(origin) <= FARTHEST_M).all():
         allowed = f"three numbers, such as 0.5,0,1.8 [m], each at most {FARTHEST_M:g}"
         raise ConfigError(f"found {text!r}", where="--at-origin", allowed=allowed)
-    pose = Pose(origin, *(math.radians(value) for value in degrees.values()))
+    pose = Pose(origin, *(math.radians(given[f"--{angle}-deg"] or 0.0) for angle in ("azimuth", "elevation", "roll")))
     poses = interleaved(part, pose, needed) if arrange == "interleaved" else side_by_side(part, pose, needed)
     if count is None and part.rays * needed > MOST_RAYS:
         raise ConfigError(f"{part.rays * needed} rays", where="--parts", hint="--rays N takes an even subset")
@@ -323,9 +317,6 @@ def show_part(part: Part, document: dict[str, Any], rich: RichConsole) -> None:
     if document["disagreements"]:
         names = ", ".join(document["disagreements"])
         rich.print(f"sources disagree about {names}; the first figure is used", soft_wrap=True)
-    if "design" in document:
-        sensors = "1 part" if document["sensors"] == 1 else f"{document['sensors']} parts"
-        rich.print(f"wrote {document['design']} ({document['design_rays']} rays of {sensors})")
 
 
 def _figure(statement: Any) -> str:

@@ -56,7 +56,7 @@ def evaluate(
             max=1_000_000,
             help="Rays per frame and position; repeatable. Fixed patterns fire their own number, or an even subset "
             "where fewer are asked for.",
-            show_default="the task's and those of fixed patterns",
+            show_default="the task's and the designs'",
         ),
     ] = None,
     baseline: Annotated[

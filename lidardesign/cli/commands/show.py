@@ -190,6 +190,7 @@ def _show_differences(files: Sequence[Path], designs: Sequence[DesignSpec], outp
     """The sensors of two designs in pairs, what both cost, and the constraints that only one has or that differ."""
     from lidardesign.run.yaml import leaves
     from lidardesign.sensors.compare import difference, paired_sensors, readout_of
+    from lidardesign.sensors.design_file import pattern_document
 
     ours, theirs = (dict(leaves(design.constraints)) for design in designs)
     keys = [key for key in {**ours, **theirs} if key and ours.get(key) != theirs.get(key)]
@@ -205,6 +206,7 @@ def _show_differences(files: Sequence[Path], designs: Sequence[DesignSpec], outp
             for path, design in zip(files, designs, strict=True)
         ],
         "sensors": [difference(*pair) for pair in paired_sensors(*designs)],
+        "rays_differ": len({repr([*map(pattern_document, design.patterns)]) for design in designs}) > 1,
         "constraints": {".".join(map(str, key)): [ours.get(key), theirs.get(key)] for key in keys},
     }
     output.result(document, lambda rich: _show_pair(document, rich), show_costs=False)
@@ -233,6 +235,8 @@ def _show_pair(document: dict[str, Any], rich: RichConsole) -> None:
         alone = [pair[key] for pair in document["sensors"] if pair[other] is None]
         if alone:
             rich.print(f"only in the {place}: {', '.join(alone)}", soft_wrap=True)
+    if document["rays_differ"]:
+        rich.print("their patterns differ: not the same rays, or in another order")
     rules = [
         (key, *("-" if one is None else str(one) for one in pair)) for key, pair in document["constraints"].items()
     ]

@@ -157,9 +157,9 @@ def numbers_alone(counts: Iterable[int], budgets: Iterable[int]) -> list[int]:
 
 
 def usual_numbers(designs: Iterable[DesignSpec], budgets: Iterable[int]) -> list[int]:
-    """The default numbers of rays: the task's, those of fixed patterns, and of chosen rays."""
+    """The default numbers of rays: the task's, those of fixed patterns and budgets, and of chosen rays."""
     designs = list(designs)
-    sizes = {design.size for design in designs if design.size is not None}
+    sizes = {design.count for design in designs if design.count is not None}
     chosen = (design.counts or () for design in designs)
     return fired_numbers(designs, sorted(sizes.union(budgets, *chosen)))
 
