@@ -15,9 +15,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 import numpy as np
 import pytest
 import typer
-from filelock import FileLock
 from hypothesis import HealthCheck, settings
-from numba.core.dispatcher import Dispatcher
 
 settings.register_profile("dev", max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.register_profile("ci", max_examples=100, deadline=None, derandomize=True, print_blob=True)
@@ -55,19 +53,12 @@ SMALL = {
 
 
 @pytest.fixture(autouse=True, scope="session")
-def work_is_shortened(tmp_path_factory):
+def work_is_shortened():
     """Rays and sensors are chosen as users choose them, but on fewer scenes: those take half a minute.
 
-    The command line is built once, not by every command; a worker waits for what another compiles, and reads it.
+    The command line is built once, not by every command.
     """
-    lock, compile_now = FileLock(tmp_path_factory.getbasetemp().parent / "compiling.lock"), Dispatcher.compile
-
-    def compile_alone(*arguments):
-        with lock:
-            return compile_now(*arguments)
-
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Dispatcher, "compile", compile_alone)
         patch.setattr(typer.main, "get_command", functools.cache(typer.main.get_command))
         for name, (number, modules) in SMALL.items():
             for module in modules.split():
