@@ -27,6 +27,7 @@ from lidardesign.run.arrays import NUMERIC_KINDS, csv_rows, csv_table, read_npz
 from lidardesign.run.files import write_atomic
 from lidardesign.run.inputs import RAY_TABLE
 from lidardesign.scenes.rays import Rays
+from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.sensor import DEFAULT_LEVEL, MOST_RAYS, Sensor, interval_factor
 from lidardesign.space import FULL_TURN, MOST_TURNS, angles, direction
@@ -113,8 +114,8 @@ def rig_of_columns(columns: RayColumns, kind: str) -> Rig:
     start, end, times = numbers[START], numbers[END], numbers[TIME]
     columns.refuse(start < 0, START, "negative", "0 m or more")
     columns.refuse(end < start, END, "before the gate's start", "at least the gate's start")
-    even = np.linspace(times[0], times[-1], len(times))
-    if np.abs(times - even).max() > EVEN_TIMES * max(abs(times[-1] - times[0]), np.abs(times).max()):
+    even = times[0] + np.arange(len(times)) / (Bandwidth().rate_hz * len(times))
+    if np.abs(times - even).max() > EVEN_TIMES * max(even[-1] - even[0], np.abs(times).max()):
         notes.append(f"{TIME} is not kept: rays fire evenly over a frame, in the order of the file")
     gate = np.stack([start, end], axis=1)
     order = np.argsort(columns.sensor, kind="stable")

@@ -126,8 +126,9 @@ def append_line(path: Path, line: str) -> None:
 
 
 def _unwritten(path: Path, error: OSError) -> DataError:
-    reason = error.strerror or str(error)
-    return DataError(f"cannot be written: {reason}", where=str(path), hint="check the folder and the space left")
+    return DataError(
+        f"cannot be written: {error.strerror or error}", where=str(path), hint="check the folder and the space left"
+    )
 
 
 def temporary_beside(path: Path) -> Path:

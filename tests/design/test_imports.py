@@ -137,12 +137,11 @@ def test_names_keep_the_line_ends_of_other_scripts(tmp_path):
     assert sensor.name == "left\u2028eye"
 
 
-def test_uneven_firing_times_are_told(tmp_path):
+def test_firing_times_that_are_not_even_over_a_frame_are_told(tmp_path):
     looks = {"azimuth_deg": [0, 10, 20], "elevation_deg": [0, 0, 0], "gate_end_m": [1, 1, 1], "gate_start_m": [0, 0, 0]}
-    even = load_design(write_rays(tmp_path / "t.csv", {**looks, "time_s": [0, 0.1, 0.2]}))
-    assert not any("time_s" in note for note in even.provenance["notes"])
-    uneven = load_design(write_rays(tmp_path / "t.csv", {**looks, "time_s": [0, 0.01, 0.2]}))
-    assert any("time_s" in note for note in uneven.provenance["notes"])
+    for times, told in (([0, 1 / 30, 2 / 30], False), ([0, 0.01, 2 / 30], True), ([0, 0.001, 0.002], True)):
+        design = load_design(write_rays(tmp_path / "t.csv", {**looks, "time_s": times}))
+        assert any("time_s" in note for note in design.provenance["notes"]) == told
 
 
 GOOD = "azimuth_rad,elevation_rad,gate_end_m"
