@@ -67,11 +67,12 @@ class FolderConfig(TaskConfig):
     def sides(self) -> tuple[dict[str, str], dict[str, str]]:
         """Names of the files that are learned from, and of those that are held out, by their SHA-256.
 
-        The recorded files, and those that are in folders of which none is recorded.
+        The recorded files, and those that are in folders, or are named instead of one, of which none is recorded.
         """
         files = {Path(path): digest for path, digest in sorted(self.inputs.items()) if self.reads(Path(path))}
-        for folder in {getattr(self, key) for key in self.folders} - {None, *(path.parent for path in files)}:
-            present = filter(self.reads, sorted(Path(folder).iterdir())) if Path(folder).is_dir() else ()
+        for place in {getattr(self, key) for key in self.folders} - {None, *(path.parent for path in files)}:
+            present = filter(self.reads, sorted(Path(place).iterdir())) if Path(place).is_dir() else [Path(place)]
+            present = [path for path in present if path.is_file()]
             files |= {path: _digest(path, path.stat().st_mtime_ns, path.stat().st_size) for path in present}
         held_out = self.held_out(list(files))
         learned = {digest: path.name for path, digest in files.items() if path not in held_out}
@@ -110,11 +111,16 @@ class FolderConfig(TaskConfig):
 
 
 def moved_files(first: BaseModel, second: BaseModel) -> list[str]:
-    """Names of files that are held out with one configuration of a task and learned from with the other."""
+    """Names of files that are held out with one configuration of a task and learned from with the other.
+
+    Where no file is held out, scenes of both kinds show all of them.
+    """
     if not (isinstance(first, FolderConfig) and isinstance(second, FolderConfig)):
         return []
     (learned, held), (learned_now, held_now) = first.sides(), second.sides()
-    moved = (learned.keys() & held_now.keys() - held.keys()) | (held.keys() & learned_now.keys() - learned.keys())
+    moved = (learned.keys() & (held_now or learned_now).keys() - (held or learned).keys()) | (
+        held.keys() & learned_now.keys() - learned.keys()
+    )
     return sorted((learned | held)[digest] for digest in moved)
 
 

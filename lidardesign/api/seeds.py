@@ -201,8 +201,7 @@ def _part(progress: Progress | None, number: int, parts: int) -> Progress | None
 def _check_runs(runs: Sequence[RunFolder]) -> None:
     if len(runs) < FEWEST_RUNS:
         raise ConfigError(f"{len(runs)} run", where="runs", allowed=f"{FEWEST_RUNS} or more that differ in their seed")
-    seeds: dict[int, RunFolder] = {}
-    for run in runs:
+    for number, run in enumerate(runs):
         other = _other_setting(runs[0], run)
         if other is not None:
             raise ConfigError(
@@ -211,12 +210,13 @@ def _check_runs(runs: Sequence[RunFolder]) -> None:
                 allowed="runs that differ only in their seed",
                 hint="learn them with the same settings and another --seed",
             )
-        twin = seeds.setdefault(run.config.seed, run)
-        if twin is not run:
+        for twin in (one for one in runs[:number] if one.config.seed == run.config.seed):
             raise ConfigError(
-                f"{twin.folder} and {run.folder} have the same seed, {run.config.seed}",
+                f"{run.folder} is named twice"
+                if twin.folder.resolve() == run.folder.resolve()
+                else f"{twin.folder} and {run.folder} have the same seed, {run.config.seed}",
                 where="runs",
-                allowed="each seed once",
+                allowed="each run and each seed once",
                 hint="learn one of them with another --seed",
             )
 

@@ -396,11 +396,14 @@ def _gates(asked: str | None, base: DesignSpec | None, space: DesignSpace, layou
 def _level(asked: float | None, base: DesignSpec | None, run: RunFolder, layout: LayoutName) -> float:
     if asked is not None:
         return asked
-    usual = {True: CHOSEN_LEVEL, False: run.task.defaults.level}
     # a level that somebody asked for is kept in another layout too
-    if base is not None and (base.layout == layout or base.level != usual[base.layout == "chosen"]):
+    if base is not None and (base.layout == layout or base.level != _usual_level(run, base.layout)):
         return base.level
-    return usual[layout == "chosen"]
+    return _usual_level(run, layout)
+
+
+def _usual_level(run: RunFolder, layout: LayoutName) -> float:
+    return CHOSEN_LEVEL if layout == "chosen" else run.task.defaults.level
 
 
 def _world(options: FitOptions, base: DesignSpec | None) -> tuple[str | None, tuple[str, ...]]:

@@ -90,6 +90,7 @@ def test_runs_of_other_settings_tasks_or_of_one_seed_are_refused(runs, tmp_path)
     for given, words in (
         (runs[:2], r"differ in task\.variation"),
         (runs[::2], "have the same seed, 1"),
+        (2 * [package.open_run(runs[0])], "is named twice"),
         (runs[:1], "1 run"),
         ([runs[0], other], "differ in task"),
     ):

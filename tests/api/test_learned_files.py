@@ -43,7 +43,7 @@ def learned(tmp_path_factory):
 
 @pytest.fixture
 def place(learned):
-    shutil.rmtree(learned / "meshes")
+    shutil.rmtree(learned / "meshes", ignore_errors=True)
     shutil.copytree(learned / "as learned", learned / "meshes")
     return learned
 
@@ -102,9 +102,13 @@ def test_no_setting_moves_a_mesh_between_learning_and_scoring(place):
     elsewhere = run.with_settings([f"folder={copy}"])
     assert (splits(elsewhere), elsewhere.metric) == (splits(run), run.metric)
     (copy / "c.stl").unlink()
-    for setting in ("test_share=0.2", "test_share=0.8", f"folder={copy}"):
+    (place / "one").mkdir()
+    shutil.copy(place / "meshes" / next(iter(splits(run)["train"])), place / "one")
+    for setting in ("test_share=0.2", "test_share=0.8", f"folder={copy}", f"folder={place}/one"):
         with pytest.raises(ConfigError, match="changes which files are held out"):
             run.with_settings([setting])
+    shutil.rmtree(place / "meshes")
+    assert ld.open_run(place / "run").summary()["metric"]["unit"] == run.metric.unit
 
 
 def test_what_went_or_changed_moves_no_other_mesh(place):

@@ -293,7 +293,7 @@ CASES = [
     ("evaluate good.yaml --in run --rays 9 --baseline no-visibility", 2, "", "no design to refit"),
     ("evaluate good.yaml", 2, "", "--in RUN"),
     ("evaluate fitted second --designs absent", 2, "--designs", "'absent'"),
-    ("evaluate fitted second fitted", 2, "", "the same seed"),
+    ("evaluate fitted second fitted", 2, "", "fitted is named twice"),
     ("evaluate fitted second --effects audit", 2, "--effects audit", "one run"),
     ("evaluate fitted second --accuracy", 2, "--accuracy", "one run"),
     ("evaluate fitted --designs absent", 2, "--designs", "fit"),

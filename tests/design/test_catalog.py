@@ -469,7 +469,8 @@ def test_a_part_is_written_as_a_design_that_other_commands_read(call, tmp_path):
     beside = call("catalog", "show", "vl53l8cx", "--out", "wide.yaml", "--parts", "2", "--arrange", "beside", "-q")
     assert (beside.code, beside.out) == (0, "wide.yaml\n"), beside.err
     one, other = load_design(tmp_path / "wide.yaml").sensors
-    assert other.azimuth_rad - one.azimuth_rad == pytest.approx(math.radians(45 - 360))
+    assert math.acos(one.boresight @ other.boresight) == pytest.approx(math.radians(45))
+    assert one.elevation_rad == other.elevation_rad == 0
 
 
 @pytest.mark.parametrize(
@@ -478,11 +479,15 @@ def test_a_part_is_written_as_a_design_that_other_commands_read(call, tmp_path):
         (("--rays", "10"), "says how a design is made"),
         (("--at-origin", "0,0,0"), "says how a design is made"),
         (("--out", "o.yaml", "--at-origin", "1,2"), "three numbers"),
-        (("--out", "o.yaml", "--elevation-deg", "91"), "equal to 90"),
+        (("--out", "o.yaml", "--elevation-deg", "91"), "90"),
+        (("--out", "o.yaml", "--azimuth-deg", "361"), "360"),
+        (("--out", "o.yaml", "--roll-deg", "nan"), "--roll-deg"),
         (("--out", "o.yaml", "--arrange", "beside"), "is for several parts"),
         (("--out", "o.yaml", "--arrange", "stacked", "--parts", "2"), "interleaved"),
         (("--out", "o.yaml", "--parts", "2", "--rays", "129"), "129 rays of 2 x vl53l8cx"),
         (("--out", "o.yaml", "--parts", "1000"), "--rays N takes an evenly spread subset"),
+        (("--reflectance", "0"), "--reflectance"),
+        (("--klux", "-1"), "--klux"),
         (("--reflectance", "5"), "no source of vl53l8cx states a range"),
     ],
 )
