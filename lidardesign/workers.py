@@ -19,10 +19,12 @@ import types
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, wait
 from functools import partial
 from itertools import islice
+from multiprocessing.connection import Connection
+from multiprocessing.pool import ExceptionWithTraceback
+from queue import SimpleQueue
 from typing import Any, Protocol, TypeVar
 
 from lidardesign import __version__
@@ -40,6 +42,7 @@ SAME_HINT = "install the same versions of lidardesign and of the task for the sc
 AHEAD = 2
 _one_at_a_time = threading.Lock()
 Result = TypeVar("Result")
+Submit = Callable[..., Future[Any]]
 
 
 class Starmap(Protocol):
@@ -89,12 +92,12 @@ def opened_workers(workers: int | str, task: Task, scenes: int) -> Iterator[Star
             hint="workers import a task by its entry point; without workers any task will do",
         )
     opened = _cluster(workers, task) if isinstance(workers, str) else _processes(min(workers, scenes))
-    with opened as (executor, threads):
-        yield partial(_map_there, executor, threads, task)
+    with opened as (submit, threads):
+        yield partial(_map_there, submit, threads, task)
 
 
 def _map_there(
-    executor: Executor,
+    submit: Submit,
     threads: Callable[[], int],
     task: Task,
     function: Callable[..., Result],
@@ -104,7 +107,7 @@ def _map_there(
     asked, waiting, versions = iter(asked), deque[Future[Result]](), _versions(task)
     while True:
         for arguments in islice(asked, max(threads() + AHEAD - len(waiting), 0)):
-            waiting.append(executor.submit(_call, versions, task, function, *arguments))
+            waiting.append(submit(_call, versions, task, function, *arguments))
         if not waiting:
             return
         first = waiting.popleft()
@@ -131,29 +134,68 @@ def _check_versions(wanted: str, task: Task) -> None:
 
 
 @contextlib.contextmanager
-def _processes(count: int) -> Iterator[tuple[Executor, Callable[[], int]]]:
-    """Worker processes of this machine, all started at once and killed at the end, even while busy."""
-    others = multiprocessing.active_children()
-    executor = ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), initializer=_end_with_parent)
+def _processes(count: int) -> Iterator[tuple[Submit, Callable[[], int]]]:
+    """Worker processes of this machine, all started at once and killed at the end, even while busy.
+
+    Each has a thread here and a pipe of its own, which ends when its process dies, also in the middle of a message.
+    The pools of Python and of loky share one pipe: a process that dies while it writes there is waited for for ever.
+    """
+    context, processes, idle = multiprocessing.get_context("spawn"), [], SimpleQueue[Connection]()
+
+    def kill() -> None:
+        for process in processes:
+            process.kill()
+
+    def ask(function: Callable[..., Result], *arguments: Any) -> Result:
+        pipe = idle.get()
+        try:
+            pipe.send((function, arguments))
+            result, error = pipe.recv()
+        except (EOFError, OSError) as lost:
+            # calls before this one would be waited for
+            kill()
+            raise NumericalError(
+                "a worker process died",
+                where=OPTION,
+                hint="memory is the usual cause, and fewer workers need less; --workers 1 needs no second process",
+            ) from lost
+        finally:
+            idle.put(pipe)
+        if error:
+            raise error
+        return result
+
+    threads = ThreadPoolExecutor(count)
     try:
         with _undisturbed():
             for _ in range(count):
-                # a process is started if none is idle, and none is idle before it is up
-                executor.submit(os.getpid)
-        yield executor, lambda: count
+                ours, theirs = context.Pipe()
+                process = context.Process(target=_work, args=(theirs,))
+                process.start()
+                processes.append(process)
+                theirs.close()
+                idle.put(ours)
+        yield partial(threads.submit, ask), lambda: count
     except BlockingIOError as error:
         raise ConfigError(f"{count} processes could not be started: {error.strerror}", where=OPTION) from error
-    except BrokenProcessPool as error:
-        raise NumericalError(
-            "a worker process died",
-            where=OPTION,
-            hint="memory is the usual cause, and fewer workers need less; --workers 1 needs no second process",
-        ) from error
     finally:
-        for process in multiprocessing.active_children():
-            if process not in others:
-                process.kill()
-        executor.shutdown(cancel_futures=True)
+        kill()
+        threads.shutdown(cancel_futures=True)
+        for process in processes:
+            process.join()
+
+
+def _work(pipe: Connection) -> None:
+    """Answer the calls that come through a pipe, with the result or with what was raised."""
+    _end_with_parent()
+    # the other end is closed when nobody waits any more
+    with contextlib.suppress(EOFError, ConnectionError):
+        while True:
+            function, arguments = pipe.recv()
+            try:
+                pipe.send((function(*arguments), None))
+            except Exception as error:
+                pipe.send((None, ExceptionWithTraceback(error, error.__traceback__)))
 
 
 def _end_with_parent() -> None:
@@ -180,7 +222,7 @@ def _undisturbed() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _cluster(address: str, task: Task) -> Iterator[tuple[Executor, Callable[[], int]]]:
+def _cluster(address: str, task: Task) -> Iterator[tuple[Submit, Callable[[], int]]]:
     """Workers of a running scheduler, which gives the scenes of lost workers to others.
 
     Logs of dask.distributed about lost connections are silenced in favour of the errors raised here.
@@ -219,7 +261,7 @@ def _cluster(address: str, task: Task) -> Iterator[tuple[Executor, Callable[[], 
         try:
             threads()
             _check_cluster(client, task)
-            yield client.get_executor(pure=False), threads
+            yield client.get_executor(pure=False).submit, threads
         except KilledWorker as error:
             why = "the workers of a scene died, one after the other"
             raise NumericalError(why, where=OPTION, hint="their logs say why; memory is the usual cause") from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
 import signal
@@ -11,6 +12,7 @@ import time
 from dataclasses import replace
 from multiprocessing.context import SpawnProcess
 
+import psutil
 import pytest
 from support.command_line import make_run, program
 from support.plugins import install_plugins
@@ -122,14 +124,15 @@ def run(tmp_path_factory):
 
 def children(pid):
     """Processes that a process started and that run."""
-    listed = subprocess.run(["ps", "-A", "-o", "pid=,ppid=,stat="], capture_output=True, text=True, check=True).stdout
-    lines = [line.split() for line in listed.splitlines()]
-    return [int(child) for child, parent, state in lines if int(parent) == pid and not state.startswith("Z")]
+    with contextlib.suppress(psutil.NoSuchProcess):
+        return [child.pid for child in psutil.Process(pid).children() if runs(child.pid)]
+    return []
 
 
 def runs(pid):
-    listed = subprocess.run(["ps", "-o", "stat=", "-p", str(pid)], capture_output=True, text=True, check=False)
-    return bool(listed.stdout.strip()) and not listed.stdout.strip().startswith("Z")
+    with contextlib.suppress(psutil.NoSuchProcess):
+        return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
+    return False
 
 
 def wait_until(condition, seconds=60.0):
@@ -138,6 +141,28 @@ def wait_until(condition, seconds=60.0):
     while not condition() and time.monotonic() < end:
         time.sleep(0.05)
     return condition()
+
+
+USING_WORKERS = {
+    "evaluate": ("--rays", 20_000, "--baseline", "none", "--set", "test=200"),
+    "fit": ("--sensors", 2, "--name", "killed"),
+    "constrain": ("--sensors", 2, "--name", "killed"),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+@pytest.mark.parametrize("command", USING_WORKERS)
+def test_a_command_ends_when_a_worker_is_killed(run, command):
+    ended = program(command, run, *USING_WORKERS[command], "--workers", 2, text=True)
+    try:
+        assert wait_until(lambda: len(children(ended.pid)) == 3 or ended.poll() is not None)
+        os.kill(children(ended.pid)[-1], signal.SIGKILL)
+        _, err = ended.communicate(timeout=60)
+    finally:
+        ended.kill()
+    assert ended.returncode == 5
+    assert "a worker process died" in err
 
 
 @pytest.mark.slow

@@ -56,7 +56,7 @@ def executor():
 
 @pytest.fixture
 def starmap(executor):
-    return partial(workers._map_there, executor, lambda: 2, FlatlandTask())
+    return partial(workers._map_there, executor.submit, lambda: 2, FlatlandTask())
 
 
 def test_rows_do_not_depend_on_who_scores_or_in_which_order(starmap):
@@ -68,7 +68,7 @@ def test_effects_are_planned_and_audited_by_workers_as_they_are_here():
     planner = Planner(load_detector("single-photon"))
     request = make_request(planner=planner, audit=True, rays=(8,), equal_bandwidth=False, baselines=("uniform",))
     request = replace(request, test=request.test[:2])
-    starmap = partial(workers._map_there, BackwardExecutor(), lambda: 0, request.task)
+    starmap = partial(workers._map_there, BackwardExecutor().submit, lambda: 0, request.task)
     assert results(evaluate(replace(request, starmap=starmap))) == results(evaluate(request))
 
 
