@@ -29,20 +29,32 @@ LONG := $(BIN)/python -m pytest -p tests.conftest -p benchmarks.soak.long_runs -
 
 .PHONY: demo test docs dist consumers setup system-programs test-arithmetic test-pythons coverage mutation lint fuzz soak soak-benchmarks soak-runs soak-seeds soak-kills soak-promise clean
 
-$(BIN)/.ready: pyproject.toml constraints.txt
-	@echo "Setting up $(VENV): once, a minute or more"
-	@$(PYTHON) -m venv $(VENV)
-	@$(BIN)/python -m pip install --quiet --upgrade pip
-	@# setuptools announces every editable install with a warning
-	@PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable .
+# setuptools announces every editable install with a warning
+INSTALL := PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable
+
+$(BIN)/.environment: pyproject.toml constraints.txt
+	@tools/environment.sh "$(PYTHON)" $(VENV)
+	@touch $@
+
+$(BIN)/.ready: $(BIN)/.environment
+	@$(INSTALL) .
 	@touch $@
 
 demo: $(BIN)/.ready
 	$(BIN)/python examples/demo.py
 
-# What tests and documentation need besides
-$(BIN)/.dev: $(BIN)/.ready
-	@PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+# What the tests need: with what reads exported files, models of robots and the light-transport simulator, or else without.
+# The models come alone: what runs them is not needed.
+MODELS := dm-control==1.0.50 gymnasium-robotics==1.4.2 robosuite==1.5.2
+$(BIN)/.test: $(BIN)/.environment
+	@echo "Adding what tests need, also the readers of exported files and the light-transport simulator: once, 0.7 GB"
+	@($(INSTALL) '.[test,transport,consumers]' && $(BIN)/python -m pip install --quiet --no-deps $(MODELS)) \
+		|| (echo "Not all could be installed; tests that need more are skipped" && $(INSTALL) '.[test]')
+	@touch $@ $(BIN)/.ready
+
+# What documentation and releases need besides
+$(BIN)/.dev: $(BIN)/.test
+	@$(INSTALL) '.[dev]'
 	@touch $@
 
 # The variable leaves out an announcement of the theme's makers
@@ -50,41 +62,28 @@ docs: $(BIN)/.dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 	@echo "build/site/index.html"
 
-$(BIN)/.transport: $(BIN)/.dev
-	@echo "Adding the light-transport simulator: once, 200 MB"
-	@PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[transport]' \
-		&& touch $@ || echo "It could not be installed; its tests are skipped"
-
-# Models of robots, alone: what runs them is not needed
-MODELS := dm-control==1.0.50 gymnasium-robotics==1.4.2 robosuite==1.5.2
-$(BIN)/.consumers: $(BIN)/.dev
-	@echo "Adding the readers of exported files and models of robots: once, 450 MB"
-	@PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[consumers]' \
-		&& $(BIN)/python -m pip install --quiet --no-deps $(MODELS) && touch $@ \
-		|| echo "They could not be installed; their tests are skipped"
-
 # Programs of the system's packages: in CI and on demand alone. Tests that miss one are skipped and say why.
-system-programs: $(BIN)/.transport
+system-programs: $(BIN)/.test
 	@tools/install-llvm.sh $(BIN)/python
 	@tools/install-consumers.sh
 
-consumers: $(BIN)/.transport $(BIN)/.consumers system-programs
+consumers: system-programs
 
 # All that the tests need
-setup: $(BIN)/.dev $(BIN)/.transport $(BIN)/.consumers $(if $(filter true,$(CI)),system-programs)
+setup: $(BIN)/.test $(if $(filter true,$(CI)),system-programs)
 
 test: setup
 	$(BIN)/python -m ruff check --no-cache .
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
 # Every kind of processor rounds in its own way, and a small run ends elsewhere on each: this is another one
-test-arithmetic: $(BIN)/.dev
+test-arithmetic: $(BIN)/.test
 	ATEN_CPU_CAPABILITY=default MKL_CBWR=COMPATIBLE \
 		NUMBA_CPU_NAME=generic NUMBA_CACHE_DIR="$(CURDIR)/build/numba-generic" \
 		$(BIN)/python -m pytest tests/docs/test_docs_run.py
 
 # What every other Python that is found makes of the installation and of the core
-test-pythons: $(BIN)/.dev
+test-pythons: $(BIN)/.test
 	tools/test-pythons.sh $(BIN)/python
 
 dist: $(BIN)/.dev
@@ -103,36 +102,36 @@ coverage: $(BIN)/.dev
 	$(BIN)/python -m coverage report --fail-under=95
 
 # Small changes of the core's code, and how many of them its tests notice: half an hour
-mutation: $(BIN)/.dev
+mutation: $(BIN)/.test
 	$(BIN)/python tools/mutation.py --out docs/soak/mutation-$$(date -u +%F).md $(if $(AMOUNT),--sample $(AMOUNT))
 
-lint: $(BIN)/.dev
+lint: $(BIN)/.test
 	$(BIN)/python -m ruff check --no-cache .
 
-fuzz: $(BIN)/.dev
+fuzz: $(BIN)/.test
 	$(LONG) benchmarks/soak/fuzz.py --amount $(or $(AMOUNT),100000)
 
 soak: soak-benchmarks soak-runs soak-seeds soak-kills fuzz mutation
 
 # Every benchmark once, as small as it can be
-soak-benchmarks: $(BIN)/.dev
+soak-benchmarks: $(BIN)/.test
 	$(BIN)/python -m pytest -m long tests/docs
 
 # 520 runs of random configurations, some 200 of them whole: no fault, every constraint kept, the same bytes when done again
-soak-runs: $(BIN)/.dev
+soak-runs: $(BIN)/.test
 	$(LONG) benchmarks/soak/runs.py --amount $(or $(AMOUNT),520)
 
 # The face and the arm at draft and standard from 20 seeds each: every one learns well enough
-soak-seeds: $(BIN)/.dev
+soak-seeds: $(BIN)/.test
 	$(LONG) benchmarks/soak/seeds.py --amount $(or $(AMOUNT),20)
 
 # Learning, fitting and evaluating are killed at all steps and random moments: what is left can be read, and going on
 # repeats the bytes. Processes are forked, which workers with threads cannot do.
-soak-kills: $(BIN)/.dev
+soak-kills: $(BIN)/.test
 	$(LONG) -n 0 benchmarks/soak/kills.py --amount $(or $(AMOUNT),1650)
 
 # 2,000 random plans: nothing that is skipped changes more than is tolerated
-soak-promise: $(BIN)/.dev
+soak-promise: $(BIN)/.test
 	$(LONG) benchmarks/soak/promise.py --amount $(or $(AMOUNT),2000)
 
 clean:

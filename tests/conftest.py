@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import functools
 import os
 import shutil
@@ -41,6 +42,14 @@ def pytest_collection_modifyitems(items):
     """Begin with the files that take longest; everything else stays as it is."""
     order = {name: place for place, name in enumerate(LONGEST)}
     items.sort(key=lambda item: order.get(item.path.name, len(LONGEST)))
+
+
+def pytest_terminal_summary(terminalreporter):
+    """Count what was skipped by its reasons, as the last lines."""
+    skipped = terminalreporter.stats.get("skipped", ())
+    reasons = collections.Counter(report.longrepr[2].removeprefix("Skipped: ") for report in skipped)
+    for reason, count in reasons.most_common():
+        terminalreporter.write_line(f"{count} skipped: {reason}")
 
 
 # Numbers of scenes, and numbers of sensors that are tried, with the modules that read them.
