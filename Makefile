@@ -1,5 +1,5 @@
 # make demo   sets everything up in .venv and runs the whole chain on the built-in face task, three to four minutes
-# make test   sets up, lints and runs the tests, a few minutes; installs nothing outside of .venv, 2 GB there
+# make test   sets up, lints and runs the tests, a few minutes; installs nothing outside of .venv, 3.3 GB there with torch for the processor
 # make docs   writes the documentation with a search as pages of build/site, which load nothing from elsewhere
 # make consumers  installs the programs that tests give exported files to, from the system's packages, as CI does
 # make test-arithmetic  runs the commands of the docs with the arithmetic of a plain processor, two minutes
@@ -47,7 +47,7 @@ demo: $(BIN)/.ready
 # The models come alone: what runs them is not needed.
 MODELS := dm-control==1.0.50 gymnasium-robotics==1.4.2 robosuite==1.5.2
 $(BIN)/.test: $(BIN)/.environment
-	@echo "Adding what tests need, also the readers of exported files and the light-transport simulator: once, 0.7 GB"
+	@echo "Adding what tests need, also the readers of exported files and the light-transport simulator: once, 0.5 GB"
 	@($(INSTALL) '.[test,transport,consumers]' && $(BIN)/python -m pip install --quiet --no-deps $(MODELS)) \
 		|| (echo "Not all could be installed; tests that need more are skipped" && $(INSTALL) '.[test]')
 	@touch $@ $(BIN)/.ready

@@ -4,6 +4,7 @@ install it from wherever it is."""
 
 from __future__ import annotations
 
+import importlib.metadata
 import os
 import re
 import shutil
@@ -17,6 +18,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from packaging.specifiers import SpecifierSet
 
 from lidardesign.contract.scaffold import new_task
 
@@ -52,8 +54,9 @@ def unpacked(sources, tmp_path_factory) -> Path:
     code = f"from setuptools.build_meta import build_sdist; build_sdist({str(out)!r})"
     subprocess.run([sys.executable, "-c", code], cwd=sources, check=True, capture_output=True)
     (path,) = out.glob("lidardesign-*.tar.gz")
+    safely = {"filter": "data"} if hasattr(tarfile, "data_filter") else {}  # of Python 3.11.4
     with tarfile.open(path) as archive:
-        archive.extractall(out, filter="data")
+        archive.extractall(out, **safely)
     return out / path.name.removesuffix(".tar.gz")
 
 
@@ -90,6 +93,25 @@ def run_installed(installed: Path, folder: Path, *arguments: str) -> subprocess.
     )
     command = [sys.executable, "-c", code]
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+
+
+PYTHONS = ("3.11.0", "3.12.0", "3.13.0")
+
+
+def test_no_pin_that_is_installed_asks_for_a_newer_python_than_the_program():
+    asked = {(one.name, one.version): one.metadata["Requires-Python"] for one in importlib.metadata.distributions()}
+    pins = [tuple(line.split("==")) for line in (ROOT / "constraints.txt").read_text().splitlines() if "==" in line]
+    ranges = {pin: SpecifierSet(asked[pin] or "") for pin in pins if pin in asked}
+    assert len(ranges) > 50
+    assert not [pin for pin, allowed in ranges.items() if not all(version in allowed for version in PYTHONS)]
+
+
+@pytest.mark.skipif("CI" not in os.environ, reason="asks the package index of every pin, half a minute: in CI")
+@pytest.mark.parametrize("version", PYTHONS)
+def test_every_pin_has_a_file_for_every_python(version):
+    """Also those of documentation and releases, which tests do not install."""
+    asked = ["install", "--dry-run", "--no-deps", "--ignore-installed", "--target", "nowhere"]
+    pip(*asked, "--python-version", version, "-r", str(ROOT / "constraints.txt"))
 
 
 def test_the_sdist_holds_every_file_of_the_checkout(sources, unpacked):

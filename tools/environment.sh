@@ -17,7 +17,7 @@ versions='import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14))'
 torch=$("$2/bin/python" -m pip install --quiet --dry-run --no-deps --constraint constraints.txt --report - torch 2>/dev/null |
     grep -o '"version": "[^"]*"' | tail -n 1)
 case "$(uname -s) $torch" in
-Linux*+cpu* | [!L]*) size="0.6 GB are downloaded, 1.7 GB installed (torch for the processor alone)" ;;
+Linux*+cpu* | [!L]*) size="0.4 GB are downloaded, 1.7 GB installed (torch for the processor alone)" ;;
 *) size="3 GB are downloaded, 6 GB installed (torch with its libraries for graphics cards; docs/install.md has less)" ;;
 esac
 echo "Setting up $2, once: $size"

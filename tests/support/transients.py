@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import math
+import os
+import subprocess
+import sys
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -14,9 +18,21 @@ from lidardesign.simulate.light_transport import transport as process
 from lidardesign.simulate.light_transport.transport import Lights, Transients
 from support.rays import rays_along
 
-needs_simulator = pytest.mark.skipif(
-    process.missing() is not None, reason=f"the light-transport simulator cannot run here: {process.missing()}"
-)
+
+@cache
+def no_simulator() -> str | None:
+    """Reason why the light-transport simulator cannot run here, or None: a library of the system may be missing too."""
+    reason = process.missing()
+    code = "import drjit, mitsuba; mitsuba.set_variant('llvm_ad_mono'); import mitransient"
+    environment = {**os.environ, process.LLVM_VARIABLE: str(process.llvm_library())}
+    if reason is None:
+        command = [sys.executable, "-c", code]
+        begun = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+        reason = begun.stderr.splitlines()[-1] if begun.returncode else None
+    return reason and f"the light-transport simulator cannot run here: {reason}"
+
+
+needs_simulator = pytest.mark.skipif(no_simulator() is not None, reason=str(no_simulator()))
 
 
 def spiral(count: int, half_angle_rad: float, axis: tuple[float, ...] = (1.0, 0.0, 0.0)) -> np.ndarray:
