@@ -6,6 +6,7 @@ number of workers. Workers report their own times, which add up to more than the
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import itertools
 import logging
@@ -248,9 +249,12 @@ def _cluster(address: str, task: Task) -> Iterator[tuple[Submit, Callable[[], in
         # many rays make a long message, which is short compared with their simulation
         warnings.filterwarnings("ignore", "Sending large graph", UserWarning)
         try:
-            client = _answered(lambda: Client(address, timeout=SCHEDULER_SECONDS, set_as_default=False))
-        except (OSError, ValueError) as error:
-            why = " ".join(str(error).split()) or "something listens there, but it is not a dask scheduler"
+            _answered(lambda: asyncio.run(_greet(address)))
+            client = Client(address, timeout=SCHEDULER_SECONDS, set_as_default=False)
+        except Exception as error:
+            # what is no OSError comes of bytes that are not a scheduler's
+            said = str(error) if isinstance(error, OSError) else ""
+            why = " ".join(said.split()) or "something listens there, but it is not a dask scheduler"
             raise ConfigError(f"no scheduler answers at {address}: {why}", where=OPTION, hint=hint) from None
         opened.callback(client.close)
 
@@ -284,8 +288,18 @@ def _check_cluster(client: Any, task: Task) -> None:
         raise ConfigError(f"the cluster cannot run this program: {error}", where=OPTION, hint=SAME_HINT) from error
 
 
+async def _greet(address: str) -> None:
+    """Ask a scheduler who it is: a client that meets something else there waits for it again when it ends."""
+    from distributed.comm import connect
+
+    comm = await connect(address, timeout=SCHEDULER_SECONDS)
+    await comm.write({"op": "identity", "reply": True})
+    await comm.read()
+    comm.abort()
+
+
 def _answered(connect: Callable[[], Any]) -> Any:
-    """Result of a connection with a time limit; the client itself waits for ever if no scheduler is at the address.
+    """Result of a connection with a time limit: nothing may ever come from what listens there.
 
     Raises:
         TimeoutError: No answer in time.
