@@ -115,7 +115,9 @@ def keep_texts(values: dict[str, Any], model: type[BaseModel], texts: Mapping[Ke
         kinds = {part for part in admitted if isinstance(part, type)}
         is_text = kinds & {*LIKE_TEXT} and not kinds & {bool, int, float, type(value)}
         text = texts.get(path, value) if is_text else value
-        words = [word for part in admitted if typing.get_origin(part) is typing.Literal for word in typing.get_args(part)]
+        words = [
+            word for part in admitted if typing.get_origin(part) is typing.Literal for word in typing.get_args(part)
+        ]
         if any(issubclass(kind, Path) for kind in kinds) and isinstance(text, str) and text and text not in words:
             text = os.path.abspath(base / os.path.expanduser(text))
         apply_override(values, Override(path, text, ""))
@@ -161,11 +163,17 @@ def _explain(
     return ConfigError(f"{name}{found}{more}".removeprefix(": "), where=where, allowed=_allowed(detail["type"], text))
 
 
+ALLOWED = {
+    "list_type": "a list, such as [a, b]",
+    "model_type": "keys and values, such as `{key: value}`",
+    "path_type": "a path",
+    "tuple_type": "a list, such as [a, b]",
+}
+
+
 def _allowed(kind: str, text: str) -> str:
-    if kind == "model_type":
-        return "keys and values, such as `{key: value}`"
     words = text.removeprefix("Input should be ")
-    return words[:1].lower() + words[1:]
+    return ALLOWED.get(kind) or words[:1].lower() + words[1:]
 
 
 def _real_path(location: tuple[Any, ...], values: Any) -> KeyPath:

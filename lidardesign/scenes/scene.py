@@ -112,9 +112,7 @@ class Plane:
     """The half space z <= 0, whose surface is the infinite plane z = 0 with the normal +z."""
 
 
-CLOUD_HINT = (
-    "make a mesh of it, as with the Poisson surface reconstruction of CloudCompare, MeshLab or Open3D, and export it as PLY"
-)
+CLOUD_HINT = "make a mesh of it: Poisson surface reconstruction in MeshLab, CloudCompare or Open3D"
 
 
 def check_triangles(vertices: np.ndarray, faces: np.ndarray, where: str = "mesh") -> None:

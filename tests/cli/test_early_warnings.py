@@ -64,7 +64,8 @@ def test_the_error_about_sigma_leaves_units_alone_where_scenes_are_small():
 def test_large_meshes_are_doubted_only_where_no_unit_was_given():
     assert doubtful_meshes({"a.stl": 19.9}, 1.0) == doubtful_meshes({"a.stl": 300.0}, 0.01) == []
     assert doubtful_meshes({"a.stl": 300.0}, 1.0)[0].startswith("a.stl: is 300 m long")
-    assert doubtful_meshes({"a.stl": 300.0, "b.stl": 0.1}, 1.0)[0].startswith("1 of 2 meshes")
+    assert doubtful_meshes({"a.stl": 30.0, "b.stl": 1.0}, 1.0)[0].startswith("1 of 2 meshes")
+    assert doubtful_meshes({"a.stl": 0.1}, 1.0, {"room.stl": 30.0})[0].startswith("1 of 2 meshes")
 
 
 @pytest.mark.parametrize("reach_m", [1.5, 2000.0])
