@@ -20,7 +20,7 @@ from lidardesign.numerics import COARSE_SLACK
 from lidardesign.registry import UnknownTaskError, load_task, plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.run.manifest import read_manifest, verify, write_recorded
-from lidardesign.run.validation import Override, anchor_paths, apply_override, check_model, is_name, parse_overrides
+from lidardesign.run.validation import Override, apply_override, check_model, is_name, keep_texts, parse_overrides
 from lidardesign.run.yaml import Document, KeyPath, dump_yaml, leaves, load_yaml, merged
 from lidardesign.space import DIMENSIONS, FARTHEST_M, SHORTEST_M, DesignSpace
 from lidardesign.task import Task, TaskConfig, moved_files
@@ -381,8 +381,8 @@ def _lay_file(layers: _Layers, task: Task, document: Document) -> None:
             for length in range(2, len(path) + 1):
                 layers.origins[path[:length]] = document.locate(path[:length])
                 layers.keys[path[:length]] = document.locate(path[:length], key=True)
-    base = Path(document.where).absolute().parent
-    anchor_paths(layers.values["task"], document.mapping.get("task") or {}, task.Config, base)
+    texts = {path[1:]: text for path, text in document.texts.items() if path[0] == "task"}
+    keep_texts(layers.values["task"], task.Config, texts, Path(document.where).absolute().parent)
 
 
 def _lay_override(layers: _Layers, task: Task, override: Override) -> None:
@@ -391,10 +391,8 @@ def _lay_override(layers: _Layers, task: Task, override: Override) -> None:
     path = apply_override(layers.values, replace(override, path=path))
     layers.origins[path] = override.where
     if path[0] == "task":
-        touched: Any = override.value
-        for key in reversed(path[1:]):
-            touched = {key: touched}
-        anchor_paths(layers.values["task"], touched, task.Config, Path.cwd())
+        texts = {(*path[1:], *within): text for within, text in override.texts.items()}
+        keep_texts(layers.values["task"], task.Config, texts, Path.cwd())
 
 
 def _models(task: Task) -> dict[str, type[BaseModel]]:

@@ -96,7 +96,7 @@ class FolderConfig(TaskConfig):
         before = {path: recorded[path] for path in sorted(recorded) if path.parent == folder and self.reads(path)}
         if not before:
             return {path.name: path for path in files}
-        now = {path: _digest(path, path.stat().st_mtime_ns, path.stat().st_size) for path in files}
+        now = {path: _digest(path, path.stat().st_mtime_ns, path.stat().st_size) for path in files if path.is_file()}
         by_content = {digest: path for path, digest in reversed(now.items())}
         found = {
             path.name: path

@@ -99,6 +99,26 @@ def test_a_bare_or_unknown_first_key_belongs_to_the_task():
     assert resolved.space.high[5] == 7.0
 
 
+TYPED = ("true", "1e3", "007", "2024-01-01", "off", "~x", "False", "1.50")
+
+
+@pytest.mark.parametrize("text", TYPED)
+def test_keys_for_text_and_paths_take_what_was_typed_and_other_keys_what_yaml_reads(write, tmp_path, text):
+    here = Path.cwd()
+    settings = [f"label={text}", f"model={text}", f"jitter.folder={text}", f"extra=[{text}, b]"]
+    task = resolve(TASK, overrides=[*settings, "low=-1e0"]).task
+    assert (task.label, task.model, task.jitter.folder) == (text, here / text, here / text)
+    assert (task.extra, task.low) == ((here / text, here / "b"), -1.0)
+    file = write(f"task: {{label: {text}, model: {text}, jitter: {{folder: {text}}}, extra: [{text}, b]}}")
+    task = resolve(TASK, config_file=file).task
+    assert (task.label, task.model, task.jitter.folder) == (text, tmp_path / text, tmp_path / text)
+    assert task.extra == (tmp_path / text, tmp_path / "b")
+    assert resolve(TASK, config_file=file, overrides=["model=null"]).task.model is None
+    for wrong in ("count=true", "low='1'"):
+        with pytest.raises(ConfigError, match=wrong.partition("=")[0]):
+            resolve(TASK, overrides=[wrong])
+
+
 def test_bounds_replace_those_of_the_task_and_one_number_fixes_a_dimension():
     resolved = resolve(TASK, overrides=["space.x_m=[-1, 2]", "space.z_m=1.5", "space.condition=[x_m]"])
     assert (resolved.space.low[0], resolved.space.high[0]) == (-1, 2)

@@ -42,9 +42,9 @@ def test_a_scale_that_is_no_factor_is_refused(tmp_path, scale):
 def test_a_missing_file_and_an_unknown_suffix_are_refused(tmp_path):
     with pytest.raises(DataError, match="cannot be read"):
         load_mesh(tmp_path / "nowhere.stl")
-    (tmp_path / "box.txt").write_text("v 0 0 0")
+    (tmp_path / "box.dat").write_text("v 0 0 0")
     with pytest.raises(DataError, match="suffix"):
-        load_mesh(tmp_path / "box.txt")
+        load_mesh(tmp_path / "box.dat")
 
 
 def test_a_gltf_cannot_reach_outside_its_folder(tmp_path):
@@ -78,6 +78,27 @@ def test_two_boxes_that_share_an_edge_are_closed():
     mesh = check_mesh(np.vstack([BOX_VERTICES, BOX_VERTICES + np.array([1.0, 1.0, 0.0])]), faces)
     assert mesh.sign == "solid"
     assert edge_defects(mesh.faces) == (0, 0)
+
+
+OTHERS = {
+    "a scan": (("readme.txt", "scan.LAS"), "scan.LAS is a point cloud", "Poisson surface reconstruction"),
+    "a table": (("points.csv", "._mesh.ply"), "points.csv is at most a point cloud", "Poisson"),
+    "a scene": (("model.fbx", "z.npz"), "model.fbx is a 3D scene", "GLB"),
+    "an archive": (("mesh.stl.gz",), "mesh.stl.gz is an archive", "unpack"),
+    "meshes further in": (("inside/box.stl",), "inside/box.stl is in a folder inside", "name that folder"),
+    "nothing": ((".DS_Store", "Thumbs.db"), "holds no mesh file", ""),
+}
+
+
+@pytest.mark.parametrize(("names", "found", "hint"), OTHERS.values(), ids=OTHERS)
+def test_a_folder_without_meshes_says_what_it_holds_instead_and_what_to_do(tmp_path, names, found, hint):
+    for name in names:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("x")
+    with pytest.raises(DataError) as refused:
+        list_mesh_files(tmp_path)
+    assert found in refused.value.message
+    assert hint in (refused.value.hint or "")
 
 
 def test_a_folder_lists_its_meshes_by_name_and_an_empty_one_is_refused(tmp_path):

@@ -112,6 +112,8 @@ def kind_of_value(annotation: Any) -> str:
         return f"{len(parts)} {kind_of_value(parts[0])}s"
     if origin in (list, tuple, set) and parts:
         return f"list of {kind_of_value(parts[0])}s"
+    if origin is dict:
+        return f"{kind_of_value(parts[1])}s by name"
     if isinstance(annotation, type) and issubclass(annotation, Path):
         return "path"
     return KINDS.get(annotation) or getattr(annotation, "__name__", str(annotation))

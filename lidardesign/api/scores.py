@@ -183,7 +183,8 @@ class ScoreRequest:
         Arguments:
             targets: Designs, design files, and run folders, which stand for all their designs.
             options: The choices.
-            judge: The run in whose scenes they are scored; the one that they came from by default.
+            judge: The run in whose scenes they are scored; by default a target without designs of its own, else the
+                one that they came from.
             notes: Called with every note.
 
         Raises:
@@ -191,6 +192,8 @@ class ScoreRequest:
             DataError: A design or a run is not there, or damaged.
         """
         planner, audit = options.planner()
+        runs = [RunFolder.open(target) for target in targets if isinstance(target, Path) and target.is_dir()]
+        judge = judge or next((run for run in runs if not run.design_paths()), None)
         designs = select_by_name(collect_designs(targets, judge, notes, options.designs), options.designs)
         run = learned = scoring_run(name_apart(designs), judge, notes)
         for note in learned.input_notes():

@@ -15,7 +15,7 @@ from lidardesign.report.scene_figure import own_triangles, scene_bounds
 from lidardesign.run.clock import phase
 from lidardesign.run_folder import RunFolder
 from lidardesign.scenes.casting import SceneCaster
-from lidardesign.scenes.mesh_files import SUFFIXES, Y_UP, load_mesh
+from lidardesign.scenes.mesh_files import OTHER_FORMATS, SUFFIXES, Y_UP, load_mesh
 from lidardesign.scenes.rays import Returns
 from lidardesign.scenes.scene import Body, Round, Scene, inverse_rigid
 from lidardesign.scoring.evaluation.entries import entries_of
@@ -243,7 +243,7 @@ def scene_of_file(path: Path, mount: str | None, scale: float = 1.0) -> Scene:
         ConfigError: A scale for a robot.
         DataError: The file cannot be read.
     """
-    if (suffix := path.suffix.lower()) in SUFFIXES:
+    if (suffix := path.suffix.lower()) in (*SUFFIXES, *OTHER_FORMATS):
         mesh = load_mesh(path, scale=scale)
         if suffix in Y_UP:
             mesh = replace(mesh, vertices=mesh.vertices[:, [2, 0, 1]])

@@ -17,6 +17,7 @@ from lidardesign.errors import ConfigError, DataError
 
 HEAD_BYTES = 4096
 FILE_HINT = "give a file"
+POINTER = b"version https://git-lfs.github.com/spec/"
 
 
 @dataclass(frozen=True)
@@ -107,6 +108,8 @@ def read_file(path: Path | str, kind: Kind, *, allowed: str | None = None, hint:
             f"cannot be read: {error.strerror or error}", where=str(path), allowed=allowed, hint=hint
         ) from None
     check_bytes(len(content), kind, str(path))
+    if content.startswith(POINTER):
+        raise kind.error("is a pointer of Git LFS, not the file itself", where=str(path), hint="git lfs pull")
     return content
 
 

@@ -11,7 +11,7 @@ import os
 import typing
 import unicodedata
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import UnionType
 from typing import Any, TypeVar
@@ -50,8 +50,8 @@ def nested_model(annotation: Any) -> type[BaseModel] | None:
     return models[0] if models else None
 
 
-def wrong_kinds(model: type[BaseModel], values: Any, path: KeyPath = ()) -> Iterator[tuple[KeyPath, Any]]:
-    """Paths and values of booleans and text where a model has numbers."""
+def scalars(model: type[BaseModel], values: Any, path: KeyPath = ()) -> Iterator[tuple[KeyPath, Any, list[Any]]]:
+    """Path, value, and types that a model admits there, of every scalar among the values of its keys."""
     if not isinstance(values, dict):
         return
     for name, value in values.items():
@@ -60,20 +60,25 @@ def wrong_kinds(model: type[BaseModel], values: Any, path: KeyPath = ()) -> Iter
             continue
         nested = nested_model(info.annotation)
         if nested is not None and isinstance(value, dict):
-            yield from wrong_kinds(nested, value, (*path, name))
+            yield from scalars(nested, value, (*path, name))
         else:
-            yield from _wrong_values(parts(info.annotation), value, (*path, name))
+            yield from _items(value, parts(info.annotation), (*path, name))
 
 
-def _wrong_values(admitted: list[Any], value: Any, path: KeyPath) -> Iterator[tuple[KeyPath, Any]]:
-    if isinstance(value, list | tuple):
-        for index, item in enumerate(value):
-            yield from _wrong_values(admitted, item, (*path, index))
-    if not {int, float} & {part for part in admitted if isinstance(part, type)}:
+def _items(value: Any, admitted: list[Any], path: KeyPath) -> Iterator[tuple[KeyPath, Any, list[Any]]]:
+    if not isinstance(value, list | tuple):
+        yield path, value, admitted
         return
+    for index, item in enumerate(value):
+        yield from _items(item, admitted, (*path, index))
+
+
+def _is_no_number(value: Any, admitted: list[Any]) -> bool:
+    """True for a boolean or text where a model has numbers."""
+    if not {int, float} & {part for part in admitted if isinstance(part, type)}:
+        return False
     words = any(typing.get_origin(part) is typing.Literal or part in LIKE_TEXT for part in admitted)
-    if (isinstance(value, bool) and bool not in admitted) or (isinstance(value, str) and not words):
-        yield path, value
+    return (isinstance(value, bool) and bool not in admitted) or (isinstance(value, str) and not words)
 
 
 def check_model(model: type[Model], values: Any, locate: Callable[..., str], section: str = "") -> Model:
@@ -89,36 +94,33 @@ def check_model(model: type[Model], values: Any, locate: Callable[..., str], sec
         checked = model.model_validate(values)
     except ValidationError as error:
         raise _explain(model, values, error, locate, section) from None
-    for path, value in wrong_kinds(model, values):
-        path = (section, *path) if section else path
-        name, allowed = ".".join(map(str, path)), "a number, without quotes"
-        raise ConfigError(f"{name}: found {_short(value)}", where=locate(path), allowed=allowed)
+    for path, value, admitted in scalars(model, values):
+        if _is_no_number(value, admitted):
+            path = (section, *path) if section else path
+            name, allowed = ".".join(map(str, path)), "a number, without quotes"
+            raise ConfigError(f"{name}: found {_short(value)}", where=locate(path), allowed=allowed)
     return checked
 
 
-def anchor_paths(values: Any, given: Any, model: type[BaseModel], base: Path) -> None:
-    """Make the relative paths among the given values absolute where the model has the type `Path`."""
-    if not isinstance(values, dict) or not isinstance(given, dict):
-        return
-    for name, value in given.items():
-        info = model.model_fields.get(name) if isinstance(name, str) else None
-        if info is None or name not in values:
-            continue
-        nested = nested_model(info.annotation)
-        if isinstance(value, dict) and nested:
-            anchor_paths(values[name], value, nested, base)
-        elif any(isinstance(part, type) and issubclass(part, Path) for part in parts(info.annotation)):
-            words = [part for part in parts(info.annotation) if typing.get_origin(part) is typing.Literal]
-            if not any(values[name] in typing.get_args(part) for part in words):
-                values[name] = _absolute(values[name], base)
+def keep_texts(values: dict[str, Any], model: type[BaseModel], texts: Mapping[KeyPath, str], base: Path) -> None:
+    """Make values of keys for text the text that was written, and of keys for paths absolute paths; in place.
 
-
-def _absolute(value: Any, base: Path) -> Any:
-    if isinstance(value, str) and value:
-        return os.path.abspath(base / os.path.expanduser(value))
-    if isinstance(value, list):
-        return [_absolute(item, base) for item in value]
-    return value
+    Arguments:
+        values: Plain values of a model's keys.
+        model: The model.
+        texts: What was written, by path, where YAML reads something else in it, such as a boolean or a number.
+        base: The folder of relative paths.
+    """
+    for path, value, admitted in list(scalars(model, values)):
+        kinds = {part for part in admitted if isinstance(part, type)}
+        is_text = kinds & {*LIKE_TEXT} and not kinds & {bool, int, float, type(value)}
+        text = texts.get(path, value) if is_text else value
+        words = [
+            word for part in admitted if typing.get_origin(part) is typing.Literal for word in typing.get_args(part)
+        ]
+        if any(issubclass(kind, Path) for kind in kinds) and isinstance(text, str) and text and text not in words:
+            text = os.path.abspath(base / os.path.expanduser(text))
+        apply_override(values, Override(path, text, ""))
 
 
 def _explain(
@@ -161,11 +163,17 @@ def _explain(
     return ConfigError(f"{name}{found}{more}".removeprefix(": "), where=where, allowed=_allowed(detail["type"], text))
 
 
+ALLOWED = {
+    "list_type": "a list, such as [a, b]",
+    "model_type": "keys and values, such as `{key: value}`",
+    "path_type": "a path",
+    "tuple_type": "a list, such as [a, b]",
+}
+
+
 def _allowed(kind: str, text: str) -> str:
-    if kind == "model_type":
-        return "keys and values, such as `{key: value}`"
     words = text.removeprefix("Input should be ")
-    return words[:1].lower() + words[1:]
+    return ALLOWED.get(kind) or words[:1].lower() + words[1:]
 
 
 def _real_path(location: tuple[Any, ...], values: Any) -> KeyPath:
@@ -215,11 +223,13 @@ class Override:
         path: The dotted key, split.
         value: The value, read as YAML.
         where: The option as the user wrote it, for messages.
+        texts: Numbers, booleans and nulls in the value as they were written, by their paths in it.
     """
 
     path: KeyPath
     value: Any
     where: str
+    texts: Mapping[KeyPath, str] = field(default_factory=dict)
 
 
 def parse_override(text: str, option: str = "--set") -> Override:
@@ -241,9 +251,10 @@ def parse_override(text: str, option: str = "--set") -> Override:
     if not value:
         raise ConfigError(f"{key.strip()} has no value", where=where, allowed="a value", hint=UNSET_HINT)
     if value.startswith(("[", "{", '"', "'")):
-        return Override(tuple(parts), parse_yaml(value, where=where).value, where)
+        document = parse_yaml(value, where=where)
+        return Override(tuple(parts), document.value, where, document.texts)
     try:
-        return Override(tuple(parts), resolve_scalar(value), where)
+        return Override(tuple(parts), resolve_scalar(value), where, {(): value})
     except ValueError as error:
         raise ConfigError(str(error), where=where, allowed="a finite number") from None
 

@@ -48,12 +48,14 @@ class Document:
         where: The file's name (or option) for messages.
         keys: Line and column of the key of each path, from 1.
         values: Line and column of the value of each path.
+        texts: Numbers, booleans and nulls as they were written, by path.
     """
 
     value: Any
     where: str
     keys: dict[KeyPath, Position] = field(default_factory=dict)
     values: dict[KeyPath, Position] = field(default_factory=dict)
+    texts: dict[KeyPath, str] = field(default_factory=dict)
 
     def locate(self, path: KeyPath, *, key: bool = False) -> str:
         """The position `file:line:column` of a path, or of its nearest known parent.
@@ -123,7 +125,7 @@ def parse_yaml(text: str, *, where: str, empty_sections: bool = False) -> Docume
         ) from None
     except yaml.YAMLError as error:
         raise ConfigError(f"is not YAML: {' '.join(str(error).split())}", where=where) from None
-    return Document(builder.root, where, builder.keys, builder.values)
+    return Document(builder.root, where, builder.keys, builder.values, builder.texts)
 
 
 def resolve_scalar(text: str) -> Any:
@@ -181,6 +183,7 @@ class _Builder:
         self.root: Any = None
         self.keys: dict[KeyPath, Position] = {}
         self.values: dict[KeyPath, Position] = {}
+        self.texts: dict[KeyPath, str] = {}
         self._stack: list[_Frame] = []
         self._nodes = 0
         self._documents = 0
@@ -227,6 +230,8 @@ class _Builder:
             name = ".".join(map(str, self._next_path()))
             raise self._error(event, f"{name}: {error}" if name else str(error)) from None
         path = self._put(value, event)
+        if not isinstance(value, str):
+            self.texts[path] = event.value
         if plain and not event.value and len(path) > self.empty_sections:
             name = ".".join(map(str, path))
             raise self._error(event, f"{name} has no value", "a value, or null for none", "leave the key out")

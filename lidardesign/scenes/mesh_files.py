@@ -22,7 +22,7 @@ from lidardesign.numerics import ROUNDING
 from lidardesign.run.arrays import guarded
 from lidardesign.run.inputs import MESH, check_bytes, read_file
 from lidardesign.scenes.mesh_formats import AGAIN_HINT, check_count, check_gltf, check_ply, read_obj, read_off, read_stl
-from lidardesign.scenes.scene import LARGEST_WEIGHT, Mesh, Sign, check_triangles
+from lidardesign.scenes.scene import CLOUD_HINT, LARGEST_WEIGHT, Mesh, Sign, check_triangles
 from lidardesign.scenes.surface import doubled_areas
 
 if TYPE_CHECKING:
@@ -194,6 +194,28 @@ def _alone(values: np.ndarray) -> np.ndarray:
 SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
 Y_UP = (".glb", ".gltf")  # by their format; the others do not say which axis points up
 READERS = {".obj": read_obj, ".off": read_off, ".stl": read_stl}
+TABLES = (".csv", ".npy", ".npz", ".txt")
+# files of other formats by suffix: what they are, and what to do
+OTHER_FORMATS = {
+    **dict.fromkeys(TABLES, ("is at most a point cloud, not a mesh", CLOUD_HINT)),
+    **dict.fromkeys(
+        (".asc", ".e57", ".las", ".laz", ".pcd", ".pts", ".ptx", ".xyz"), ("is a point cloud, not a mesh", CLOUD_HINT)
+    ),
+    **dict.fromkeys(
+        (".3ds", ".3mf", ".dae", ".wrl", ".x3d"),
+        ("is a 3D model in a format that is not read", "open it in MeshLab and export it as PLY"),
+    ),
+    **dict.fromkeys(
+        (".blend", ".fbx", ".usd", ".usda", ".usdc", ".usdz"),
+        ("is a 3D scene in a format that is not read", "open it in Blender and export it as GLB"),
+    ),
+    **dict.fromkeys(
+        (".brep", ".iges", ".igs", ".step", ".stp"), ("is a CAD model", "open it in FreeCAD and export it as STL")
+    ),
+    **dict.fromkeys(
+        (".7z", ".bz2", ".gz", ".rar", ".tar", ".tgz", ".xz", ".zip", ".zst"), ("is an archive", "unpack it")
+    ),
+}
 # a triangle is degenerate if its double area is a smaller share of its longest edge squared
 FLATTEST_TRIANGLE = ROUNDING
 
@@ -202,7 +224,7 @@ def list_mesh_files(folder: str | Path) -> list[Path]:
     """Paths of the mesh files directly inside a folder, sorted by name.
 
     Raises:
-        DataError: No such folder, or no mesh file in it.
+        DataError: No such folder, or no mesh file in it; what is there instead.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -210,7 +232,13 @@ def list_mesh_files(folder: str | Path) -> list[Path]:
     entries = sorted(folder.iterdir())
     files = [p for p in entries if p.suffix.lower() in SUFFIXES and not (p.is_dir() or p.name.startswith("."))]
     if not files:
-        raise DataError("holds no mesh file", where=str(folder), allowed=", ".join(SUFFIXES))
+        known = {**dict.fromkeys(SUFFIXES, ("is in a folder inside it", "name that folder")), **OTHER_FORMATS}
+        others = [p for p in (*folder.glob("*/*"), *entries) if p.suffix.lower() in known and p.name[0] != "."]
+        # the last one is the most telling
+        others.sort(key=lambda path: path.suffix.lower() not in TABLES)
+        found, hint = known[others[-1].suffix.lower()] if others else ("", None)
+        found = f"holds no mesh file; {others[-1].relative_to(folder)} {found}" if others else "holds no mesh file"
+        raise DataError(found, where=str(folder), allowed=", ".join(SUFFIXES), hint=hint)
     return files
 
 
@@ -231,7 +259,8 @@ def load_mesh(path: str | Path, *, sign: Sign = "auto", scale: float = 1.0, pain
     if not (np.isfinite(scale) and scale > 0):
         raise DataError(f"the scale {scale} is not a factor to metres", where=str(path), allowed="a positive number")
     if path.suffix.lower() not in SUFFIXES:
-        raise DataError(f"has the suffix {path.suffix!r}", where=str(path), allowed=", ".join(SUFFIXES))
+        found, hint = OTHER_FORMATS.get(path.suffix.lower(), (f"has the suffix {path.suffix!r}", None))
+        raise DataError(found, where=str(path), allowed=", ".join(SUFFIXES), hint=hint)
     data = read_file(path, MESH, hint="check the path")
     if not data.strip():
         raise DataError("is an empty file", where=str(path))
@@ -390,6 +419,9 @@ def _parts(path: Path, data: bytes) -> Iterator[tuple[trimesh.Trimesh, np.ndarra
         options = {"skip_materials": True}
     resolver = _SameFolder(path)
     scene = trimesh.load_scene(io.BytesIO(data), file_type=suffix[1:], resolver=resolver, process=False, **options)
+    points = [part.vertices for part in scene.geometry.values() if not isinstance(part, trimesh.Trimesh)]
+    if len(points) == len(scene.geometry):  # refused as a point cloud
+        yield trimesh.Trimesh(np.concatenate([np.zeros((0, 3)), *points]), process=False), np.eye(4)
     for node in scene.graph.nodes_geometry:
         transform, name = scene.graph[node]
         part = scene.geometry[name]

@@ -29,7 +29,7 @@ MOST_TRIANGLES = 10_000_000
 MOST_ROWS = 5_000_000
 LONGEST_LINE = LONGEST_HEADER = 100_000
 BINARY_HINT = "export it as binary PLY or GLB"
-AGAIN_HINT = "open it in a mesh viewer and export it again"
+AGAIN_HINT = "open it in a mesh viewer and export it again, as triangles"
 
 Triangles = tuple[np.ndarray, np.ndarray, np.ndarray | None]
 
@@ -233,6 +233,9 @@ def check_ply(data: bytes, where: str) -> None:
             if len(words) != 3 or not words[2].isdigit() or len(words[2]) > 18:
                 raise DataError("is not a count of elements", where=f"{where}:{line}", allowed="element NAME COUNT")
             name, count = words[1], int(words[2])
+            if name == "tristrips" and count:
+                found, hint = "has triangle strips", "open it in MeshLab, which reads them, and export it as PLY"
+                raise DataError(found, where=f"{where}:{line}", allowed="an element `face`", hint=hint)
             total += count
         elif words[:1] == ["property"] and name:
             least += count * (PLY_BYTES.get(words[-2], 4) if words[1] != "list" else 1)

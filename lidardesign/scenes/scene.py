@@ -112,13 +112,19 @@ class Plane:
     """The half space z <= 0, whose surface is the infinite plane z = 0 with the normal +z."""
 
 
+CLOUD_HINT = "make a mesh of it: Poisson surface reconstruction in MeshLab, CloudCompare or Open3D"
+
+
 def check_triangles(vertices: np.ndarray, faces: np.ndarray, where: str = "mesh") -> None:
     """Refuse arrays that are no finite vertices (V, 3), and faces (F, 3) of them, at least one.
 
     Raises:
         DataError: What is wrong, and how many.
     """
-    if vertices.size == 0 or faces.size == 0:
+    if vertices.size and not faces.size:
+        found = f"has {len(vertices)} points and no faces: it is a point cloud or lines, not a mesh"
+        raise DataError(found, where=where, hint=CLOUD_HINT)
+    if not vertices.size:
         raise DataError("has no faces (an empty or unreadable mesh)", where=where, hint="open it in a mesh viewer")
     if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
         raise DataError(

@@ -10,18 +10,31 @@ several objects lie in a bin or on a table, and the sensor looks down at them fr
 from __future__ import annotations
 
 import itertools
+import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from fnmatch import fnmatchcase
 from functools import lru_cache
 from pathlib import Path
-from typing import ClassVar, Literal
+from shlex import quote
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Discriminator, Field, Tag, model_validator
 
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.scenes.mesh_files import COLOURS, SUFFIXES, Y_UP, Painted, list_mesh_files, load_mesh
+from lidardesign.run.validation import suggest
+from lidardesign.scenes.mesh_files import (
+    COLOURS,
+    OTHER_FORMATS,
+    SUFFIXES,
+    TABLES,
+    Y_UP,
+    Painted,
+    list_mesh_files,
+    load_mesh,
+)
 from lidardesign.scenes.rays import Returns
 from lidardesign.scenes.scene import Body, Mesh, Scene, Sign
 from lidardesign.space import FARTHEST_M, DesignSpace
@@ -43,6 +56,11 @@ from lidardesign_tasks.units import doubtful_meshes, doubtful_motion
 from lidardesign_tasks.view import OriginBox, space_around, space_around_box
 
 Axis = Literal["format", "x", "y", "z"]
+Factor = Annotated[float, Field(gt=0, le=FARTHEST_M, strict=True)]
+Scale = Annotated[
+    Annotated[Factor, Tag("one")] | Annotated[dict[str, Factor], Tag("several")],
+    Discriminator(lambda value: "several" if isinstance(value, dict) else "one"),
+]
 # the file's axes that become the world's x, y, z: a rotation of the up axis to z
 WORLD_AXES = {"x": [1, 2, 0], "y": [2, 0, 1], "z": [0, 1, 2]}
 RELATIVE_JITTER = 0.02  # of the largest extent, where no shift is given
@@ -63,7 +81,12 @@ class MeshesConfig(FolderConfig, Importance):
     folders: ClassVar[dict[str, tuple[str, ...]]] = {"folder": SUFFIXES, "occluders": SUFFIXES}
 
     folder: Path | None = Field(None, description="folder of mesh files (glb, gltf, obj, off, ply, stl)")
-    scale: float = Field(1.0, gt=0, le=FARTHEST_M, description="factor from the files' unit to metres (0.001 for mm)")
+    leave_out: tuple[str, ...] = Field((), description="names of files that are not read, or patterns such as *_old.*")
+    scale: Scale = Field(
+        1.0,
+        description="factor from the files' unit to metres (0.001 for mm); or factors by name or pattern, of which the "
+        "first that fits counts",
+    )
     sign: Sign = Field("auto", description="inside rule: auto, solid, winding or unsigned")
     up: Axis = Field("format", description="the axis of the files that points up; format: y in glb and gltf, else z")
     centre: bool = Field(True, description="move the centre of each mesh's bounds to the origin")
@@ -103,6 +126,17 @@ class MeshesConfig(FolderConfig, Importance):
         10.0, gt=1e-3, le=1e3, description="how many times as much white counts as black, with importance=colours"
     )
 
+    def reads(self, path: Path) -> bool:
+        """True if a file is one of those that are read in the folders, and not left out."""
+        return super().reads(path) and _fitting(path.name, self.leave_out) is None
+
+    def factor(self, name: str) -> float:
+        """Factor from the unit of a file to metres, 1 where none is given."""
+        if isinstance(self.scale, float):
+            return self.scale
+        pattern = _fitting(name, self.scale)
+        return 1.0 if pattern is None else self.scale[pattern]
+
     def held_out(self, files: Sequence[Path]) -> Sequence[Path]:
         """A share of the meshes, the same for all seeds; none of a single one."""
         files = [file for file in files if file.parent == self.folder]
@@ -132,6 +166,11 @@ class MeshesConfig(FolderConfig, Importance):
         if self.motion is None and self.frame_rate_hz != type(self).model_fields["frame_rate_hz"].default:
             raise ValueError("frame_rate_hz is for a motion: set motion=FILE.csv too")
         return self
+
+
+def _fitting(name: str, patterns: Iterable[str]) -> str | None:
+    """The first of some names of files, or patterns, that fits a name."""
+    return next((pattern for pattern in patterns if name == pattern or fnmatchcase(name, pattern)), None)
 
 
 class MeshesTask:
@@ -217,14 +256,16 @@ class MeshesTask:
     def notes(self, config: MeshesConfig, space: DesignSpace) -> list[str]:
         """Notes on the meshes, the split, the sensors' origins, and lengths that may be in another unit."""
         meshes = load_folder(config)
-        extents_m = {name: extent_m([mesh]) for name, mesh in [*meshes, *load_occluders(config)]}
+        extents_m = {name: extent_m([mesh]) for name, mesh in meshes}
+        around_m = {name: extent_m([mesh]) for name, mesh in load_occluders(config)}
         motion = motion_of(config, meshes)
         bounds_m = {} if motion is None else {
             name: moved_bounds_m(mesh, motion.of_object(name)) for name, mesh in meshes
         }  # fmt: skip
         return [
             *_what_was_read(config, meshes, space),
-            *doubtful_meshes(extents_m, config.scale),
+            *_what_was_not_read(config),
+            *doubtful_meshes(extents_m, config.scale, around_m),
             *doubtful_motion(bounds_m, extent_m([mesh for _, mesh in meshes]), space),
             *(f"{name} is the only mesh: {SAME_MESH}" for name, _ in meshes if len(meshes) == 1),
         ]
@@ -278,13 +319,10 @@ def _what_was_read(config: MeshesConfig, meshes: Sequence[tuple[str, Mesh]], spa
     lengths_m = sorted(extent_m([mesh]) for _, mesh in meshes)
     sizes = " to ".join(dict.fromkeys(f"{length_m:.3g}" for length_m in (lengths_m[0], lengths_m[-1])))
     held_out = [name for name, _ in split_meshes(meshes, config, "test")]
-    named = ", ".join(held_out[:MOST_NAMED]) + (
-        f" and {len(held_out) - MOST_NAMED} more" if held_out[MOST_NAMED:] else ""
-    )
     low, high = space.low[:3], space.high[:3]
     places = (f"{a:.3g}" if a == b else f"{a:.3g} to {b:.3g}" for a, b in zip(low, high, strict=True))
     count = "1 mesh" if len(meshes) == 1 else f"{len(meshes)} meshes"
-    lines = [f"{count} of {sizes} m; held out: {named}"]
+    lines = [f"{count} of {sizes} m; held out: {_named(held_out)}"]
     background = pile_of(config, meshes)
     if background is not None:
         wide, objects = 2 * background.half_m, "1 object" if config.clutter == 1 else f"{config.clutter} objects"
@@ -296,10 +334,37 @@ def _what_was_read(config: MeshesConfig, meshes: Sequence[tuple[str, Mesh]], spa
     return [*lines, f"sensors at {', '.join(named_places)} m"]
 
 
+def _what_was_not_read(config: MeshesConfig) -> list[str]:
+    """Notes on files in the folders that are left out, on those of other formats, and on folders of meshes in them."""
+    folders = [folder for folder in (config.folder, config.occluders) if folder is not None]
+    entries = [path for folder in folders for path in sorted(folder.iterdir()) if path.name[0] != "."]
+    left_out = [path.name for path in entries if _fitting(path.name, config.leave_out) is not None]
+    others: dict[tuple[str, str | None], list[str]] = {}
+    for path in entries:
+        suffix = path.suffix.lower()
+        if path.is_dir() and path != config.occluders and any(one.suffix.lower() in SUFFIXES for one in path.glob("*")):
+            others.setdefault(("a folder of meshes inside the folder", "move them out of it"), []).append(path.name)
+        elif suffix in OTHER_FORMATS and suffix not in TABLES and path.name not in left_out:
+            others.setdefault(OTHER_FORMATS[suffix], []).append(path.name)
+    return [
+        *([f"left out: {', '.join(left_out)}"] if left_out else []),
+        *(
+            f"not read: {_named(names)} ({found.removeprefix('is ')}): {hint}"
+            for (found, hint), names in others.items()
+        ),
+    ]
+
+
+def _named(names: Sequence[str]) -> str:
+    """The first of some names, and how many more there are."""
+    return ", ".join(names[:MOST_NAMED]) + (f" and {len(names) - MOST_NAMED} more" if names[MOST_NAMED:] else "")
+
+
 def load_folder(config: MeshesConfig) -> list[tuple[str, Mesh]]:
     """Name and mesh of every file, in metres, z up, centred by default."""
     if config.folder is None:
         raise ConfigError("no folder of meshes is set", where="task.folder", hint="--set folder=PATH")
+    _check_names(config)
     painted = None if config.importance is None else Painted(config.importance, config.colour_contrast)
     return _load(str(config.folder), config, config.sign, config.centre, painted)
 
@@ -334,13 +399,53 @@ def weighted(mesh: Mesh, config: MeshesConfig, space: DesignSpace) -> Mesh:
 def _load(
     folder: str, config: MeshesConfig, sign: Sign, centre: bool, painted: Painted | None = None
 ) -> list[tuple[str, Mesh]]:
-    meshes = []
-    for name, path in config.learned_files(list_mesh_files(folder)).items():
+    meshes, errors = [], {}
+    for name, path in config.learned_files(_mesh_files(folder, config)).items():
         if path is not None:
-            state = path.stat()
-            mesh = _load_file(path, state.st_mtime_ns, state.st_size, sign, config.scale, config.up, centre, painted)
-            meshes.append((name, mesh))
+            state, factor = path.stat() if path.exists() else path.lstat(), config.factor(name)
+            try:
+                mesh = _load_file(path, state.st_mtime_ns, state.st_size, sign, factor, config.up, centre, painted)
+            except DataError as error:
+                errors[name] = error
+            else:
+                meshes.append((name, mesh))
+    if errors:
+        raise _unusable(folder, errors, len(meshes), config)
     return meshes
+
+
+def _unusable(folder: str, errors: Mapping[str, DataError], usable: int, config: MeshesConfig) -> DataError:
+    """The error of files that cannot be used, with how to go on without them where there are others."""
+    first = next(iter(errors.values()))
+    names = json.dumps([*config.leave_out, *errors], ensure_ascii=False)
+    without = f"leave out what cannot be used: --set {quote(f'leave_out={names}')}"
+    # what a run was learned from stays
+    hint = "; or ".join(filter(None, (first.hint, without if usable and not config.inputs else None))) or None
+    if len(errors) == 1:
+        return DataError(first.message, where=first.where, allowed=first.allowed, hint=hint)
+    found = "; ".join(f"{Path(error.where or name).name}: {error.message}" for name, error in errors.items())
+    count = f"{len(errors)} of {len(errors) + usable} meshes cannot be used"
+    return DataError(f"{count}: {found}", where=folder, allowed=first.allowed, hint=hint)
+
+
+def _mesh_files(folder: str | Path, config: MeshesConfig) -> list[Path]:
+    """Paths of the mesh files inside a folder that are not left out, sorted by name."""
+    files = [path for path in list_mesh_files(folder) if config.reads(path)]
+    if not files:
+        raise ConfigError(f"leaves out every mesh of {folder}", where="task.leave_out", allowed="some of them")
+    return files
+
+
+def _check_names(config: MeshesConfig) -> None:
+    """Refuse names and patterns of files, in keys, that fit no file of the folders."""
+    folders = [Path(str(folder)) for folder in (config.folder, config.occluders) if folder is not None]
+    names = {path.name for folder in folders if folder.is_dir() for path in folder.iterdir()}
+    names |= {Path(path).name for path in config.inputs}
+    for key, patterns in {"leave_out": config.leave_out, "scale": config.scale}.items():
+        for pattern in () if isinstance(patterns, float) else patterns:
+            if not any(_fitting(name, [pattern]) for name in names):
+                meant = suggest(pattern, names)
+                raise ConfigError(f"{pattern!r} fits no file in the folder", where=f"task.{key}", hint=meant)
 
 
 @lru_cache(maxsize=256)
@@ -366,7 +471,7 @@ def split_meshes(meshes: Sequence[tuple[str, Mesh]], config: MeshesConfig, split
     Raises:
         DataError: No mesh of the split is left.
     """
-    names = list(config.learned_files(list_mesh_files(config.folder)))
+    names = list(config.learned_files(_mesh_files(config.folder, config)))
     if len(names) == 1:
         return list(meshes)
     held_out = {path.name for path in config.held_out([config.folder / name for name in names])}

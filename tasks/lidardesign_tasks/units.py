@@ -10,17 +10,35 @@ from lidardesign.space import RANGE, DesignSpace
 
 # Larger objects are probably in another unit, and so are longer paths, in extents of the moving object.
 DOUBTFUL_EXTENT_M, DOUBTFUL_WAY = 20.0, 50.0
+# Meshes of one folder are rarely so many times smaller or larger than most of them.
+DOUBTFUL_TIMES, MOST_NAMED = 50.0, 3
 # Robots are recorded many times per second; short recordings, which may be handwritten, are not judged.
 DOUBTFUL_STEP_S, DOUBTFUL_PAUSE_S, FEW_MOMENTS = 1.0, 3600.0, 10
 
 
-def doubtful_meshes(extents_m: Mapping[str, float], scale: float) -> list[str]:
-    """A note on very large meshes while no scale is set.
+def doubtful_meshes(
+    extents_m: Mapping[str, float], scale: float | Mapping[str, float], around_m: Mapping[str, float] | None = None
+) -> list[str]:
+    """A note on meshes of quite another size than most, or else on very large ones while no scale is set.
 
     Arguments:
         extents_m: Largest extent of each mesh, by its file's name [m].
-        scale: Configured factor to metres.
+        scale: Configured factor to metres, or factors by name or pattern.
+        around_m: The same of occluders, which may have any size.
     """
+    usual_m = sorted(extents_m.values())[(len(extents_m) - 1) // 2]
+    times = {name: extent / usual_m for name, extent in extents_m.items()}
+    odd = [name for name in extents_m if not 1 / DOUBTFUL_TIMES < times[name] < DOUBTFUL_TIMES]
+    if odd:
+        named = ", ".join(f"{name} {extents_m[name]:.3g} m" for name in odd[:MOST_NAMED])
+        more = f" and {len(odd) - MOST_NAMED} more" if odd[MOST_NAMED:] else ""
+        known = {"*": scale} if isinstance(scale, float) else scale
+        factors = ", ".join([f'"{odd[0]}": FACTOR', *(f'"{pattern}": {factor:g}' for pattern, factor in known.items())])
+        return [
+            f"the usual mesh is {usual_m:.3g} m long, {named}{more}: in other units? Set factors to metres by name or "
+            f"pattern: --set 'scale={{{factors}}}'"
+        ]
+    extents_m = {**extents_m, **(around_m or {})}
     large = {name: extent for name, extent in extents_m.items() if extent >= DOUBTFUL_EXTENT_M}
     if scale != 1.0 or not large:
         return []

@@ -67,6 +67,10 @@ def test_the_command_takes_the_run_that_is_named(lidardesign, runs):
     assert f"even of {own} is scored in the scenes of {other}" in " ".join(found.err.split())
     scores = package.open_run(other).evaluate([design], rays=[8])
     assert without_times(json.loads(found.out)) == without_times(json.loads(json.dumps(scores.as_dict())))
+    # a run without designs can only be the one that judges
+    assert without_times(lidardesign("evaluate", other, design, "--rays", 8, "--json").json) == without_times(
+        found.json
+    )
     # the run that judges has a design of the name, too
     package.open_run(other).fit(layout="even", sensors=1, rays=8, name="even").save()
     alone = ("--rays", 8, "--baseline", "none", "--json")

@@ -403,6 +403,8 @@ CASES = [
     ("capture far.npz good.yaml", 3, "far.npz", "origin_m"),
     ("capture lengths.npz good.yaml", 3, "lengths.npz", "length inf"),
     ("capture promised0.npz good.yaml", 3, "promised0.npz", "80 bytes"),
+    ("simulate good.yaml --scene scan.las --out there", 3, "scan.las", "Poisson"),
+    ("simulate good.yaml --scene part.step --scale 0.001 --out there", 3, "part.step", "FreeCAD"),
     ("capture scan.npz none.yaml", 2, "none.yaml:2:30", "budget.rays"),
     ("capture scan.npz header.galvo.csv", 3, "header.galvo.csv", "no ray"),
     ("capture scan.npz good.yaml elsewhere.yaml", 3, "elsewhere", "none of the 100 rays"),

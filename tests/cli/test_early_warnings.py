@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import trimesh
+from lidardesign_tasks.meshes import load_folder
 from lidardesign_tasks.units import doubtful_meshes, doubtful_motion
 from support.command_line import caller
 
 from lidardesign.config import load_run_config
 from lidardesign.density.objective.prepare import resolution_notes
-from lidardesign.errors import ConfigError, PluginError
+from lidardesign.errors import ConfigError, DataError, PluginError
 from lidardesign.formats.designs import read_design
 from lidardesign.registry import load_task
 from lidardesign.sensors.compare import outside_notes
@@ -64,7 +66,56 @@ def test_the_error_about_sigma_leaves_units_alone_where_scenes_are_small():
 def test_large_meshes_are_doubted_only_where_no_unit_was_given():
     assert doubtful_meshes({"a.stl": 19.9}, 1.0) == doubtful_meshes({"a.stl": 300.0}, 0.01) == []
     assert doubtful_meshes({"a.stl": 300.0}, 1.0)[0].startswith("a.stl: is 300 m long")
-    assert doubtful_meshes({"a.stl": 300.0, "b.stl": 0.1}, 1.0)[0].startswith("1 of 2 meshes")
+    assert doubtful_meshes({"a.stl": 30.0, "b.stl": 1.0}, 1.0)[0].startswith("1 of 2 meshes")
+    assert doubtful_meshes({"a.stl": 0.1}, 1.0, {"room.stl": 30.0})[0].startswith("1 of 2 meshes")
+
+
+@pytest.mark.parametrize(
+    ("sizes_m", "scale", "named"),
+    [
+        ([0.2] * 4 + [0.00027], 1.0, '"4": FACTOR, "*": 1'),
+        ([0.2] * 8 + [200.0] * 4, 1.0, '"8": FACTOR, "*": 1'),
+        ([0.0002] * 8 + [0.2] * 4, 0.001, '"8": FACTOR, "*": 0.001'),
+        ([0.2] * 4 + [200.0], {"0": 2.0}, '"4": FACTOR, "0": 2'),
+        ([0.2, 0.5, 9.0], 1.0, None),
+    ],
+)
+def test_meshes_of_another_size_than_most_are_named_with_both_sizes_and_the_key(sizes_m, scale, named):
+    notes = doubtful_meshes({str(number): size for number, size in enumerate(sizes_m)}, scale)
+    assert len(notes) == (named is not None)
+    assert named is None or all(text in notes[0] for text in (f"{sizes_m[0]:g} m", f"{sizes_m[-1]:g} m", named))
+
+
+def test_a_folder_of_mixed_files_is_as_good_as_one_without_the_bad_ones_in_one_unit(tmp_path):
+    task = load_task("meshes")
+    for number in range(4):
+        box = trimesh.creation.box((0.1 + 0.01 * number, 0.1, 0.1))
+        for folder, factor in (("good", 1), ("mixed", 1 if number % 2 else 1000)):
+            (tmp_path / folder).mkdir(exist_ok=True)
+            box.copy().apply_scale(factor).export(tmp_path / folder / f"{'m' if factor == 1 else 'mm'}{number}.ply")
+    (tmp_path / "mixed" / "empty.obj").write_text("")
+    (tmp_path / "mixed" / "cloud.off").write_text("OFF\n1 0 0\n0 0 0\n")
+    (tmp_path / "mixed" / "scan.las").write_text("x")
+
+    def meshes_of(folder, **keys):
+        config = task.Config(folder=tmp_path / folder, **keys)
+        space = task.space(config)
+        return load_folder(config), notes_of(task, config, space)
+
+    with pytest.raises(DataError, match=r"2 of 6 meshes .* cloud.off: .*; empty.obj: ") as refused:
+        meshes_of("mixed")
+    keys = json.loads(refused.value.hint.partition("leave_out=")[2].rstrip("'"))
+    assert keys == ["cloud.off", "empty.obj"]
+    mixed, notes = meshes_of("mixed", leave_out=keys, scale={"mm*": 0.001})
+    assert any(note == "left out: cloud.off, empty.obj" for note in notes)
+    assert any(note.startswith("not read: scan.las (a point cloud") for note in notes)
+    good = {name[1:]: mesh for name, mesh in meshes_of("good")[0]}
+    assert {name.lstrip("m") for name, _ in mixed} == set(good)
+    for name, mesh in mixed:
+        np.testing.assert_allclose(mesh.vertices, good[name.lstrip("m")].vertices, rtol=1e-6)
+    for keys in ({"leave_out": ["emty.obj"]}, {"scale": {"m*": 1, "x*": 2}}, {"leave_out": ["*"]}):
+        with pytest.raises(ConfigError, match=next(iter(keys))):
+            meshes_of("mixed", **keys)
 
 
 @pytest.mark.parametrize("reach_m", [1.5, 2000.0])
