@@ -91,10 +91,10 @@ def write_mjcf(
         model, place, sensors, said = _robot_with(design.mount, robot, path)
         sites = [EXPORTED.fullmatch(one.get("name", "")) for one in model.iter("site")]
         taken += [one.get("name", "") for one in model.iter("body")] + [one.group(1) for one in sites if one]
-        transparent = (
-            "geoms of the robot that are not shown are transparent, since MuJoCo's rays pass through no others"
-        )
-        notes += [*said, transparent]
+        notes += [
+            *said,
+            "geoms of the robot that are not shown are transparent, since MuJoCo's rays pass through no others",
+        ]
     names = distinct([xml_text(one.sensor.name) for one in mounted], " ", taken=taken)
     site = np.empty(len(rays), dtype=object)
     for mount, name in zip(mounted, names, strict=True):
@@ -146,8 +146,11 @@ def _robot_with(mount: str | None, robot: RobotFile, path: Path) -> tuple[Elemen
     bodies = {body.get("name", ""): body for body in root.iter("body")}
     place = next(root.iter("worldbody")) if mount is None else bodies.get(mount)
     if place is None:
-        close = ", ".join(get_close_matches(str(mount), bodies, 3, 0.0))
-        raise DataError(f"has no body {mount!r}, which the design is mounted on", where=str(robot.path), allowed=close)
+        raise DataError(
+            f"has no body {mount!r}, which the design is mounted on",
+            where=str(robot.path),
+            allowed=", ".join(get_close_matches(str(mount), bodies, 3, 0.0)),
+        )
     return root, place, sensors, said
 
 
@@ -288,8 +291,11 @@ def _base() -> list[Element]:
         "inertial", children=[element("mass", {"value": numbers([BASE_MASS_KG])}), element("inertia", moments)]
     )
     ends = [element("parent", {"link": WORLD}), element("child", {"link": BASE})]
-    joint = element("joint", {"name": f"{WORLD}_joint", "type": "fixed"}, ends)
-    return [element("link", {"name": WORLD}), element("link", {"name": BASE}, [inertial]), joint]
+    return [
+        element("link", {"name": WORLD}),
+        element("link", {"name": BASE}, [inertial]),
+        element("joint", {"name": f"{WORLD}_joint", "type": "fixed"}, ends),
+    ]
 
 
 def mounted_parts(mount: Mount, rate_hz: float, *, parent: str, prefix: str = "") -> list[Element]:

@@ -56,11 +56,13 @@ ALLOWED = "an MJCF or URDF model that MuJoCo can load"
 ADVICE = {
     "opening file": "put it there, or correct its name: upper and lower case differ; package:// is looked for in the "
     "model's folder and those above it",
+    "area is too small": "leave the mesh out, which is a line or a point",
     "coplanar": "take the flat mesh out of collisions: no <collision> in a URDF, contype and conaffinity 0 in an MJCF",
     "content type": "convert the texture to PNG, or leave it out: rays see no textures",
     "eigenvalues": "correct its inertia, or leave it out",
     "invalid header": "of a pointer of Git LFS: git lfs pull; else write the mesh again",
     "is empty": "write the mesh again",
+    "keyframe": "correct the keyframe, or leave it out",
     "plugin": "leave the plugin out: only shapes and joints count",
     "repeated name": "give one of the two another name",
     "top level": "only a root link may float: make it a root, or fix its joint",
@@ -177,8 +179,10 @@ def load_model(
     _check_places(model, path)
     if spec.compiler.discardvisual:
         collected.append("visual shapes are discarded, so rays meet the collision shapes")
-    upside_down = [model.joint(number).name for number, (low, high) in enumerate(model.jnt_range) if low > high]
-    collected += [f"the range of joint {name!r} ends below its start, so it has no limits" for name in upside_down]
+    collected += [
+        f"the range of joint {model.joint(number).name!r} ends below its start, so it has no limits"
+        for number in np.flatnonzero(model.jnt_range[:, 0] > model.jnt_range[:, 1])
+    ]
     lines = dict.fromkeys(" ".join(str(line).split()) for line in (*collected, *(one.message for one in caught)))
     return model, (*said, *changed, *(f"{path.name}: MuJoCo warns: {line}" for line in lines))
 
@@ -212,8 +216,7 @@ def _check_places(model: mujoco.MjModel, path: Path) -> None:
     Raises:
         DataError: Such a value, with its body, geom or joint.
     """
-    names = ("body_pos", "body_quat", "geom_pos", "geom_quat", "geom_size", "jnt_pos", "jnt_range")
-    for name in names:
+    for name in ("body_pos", "body_quat", "geom_pos", "geom_quat", "geom_size", "jnt_pos", "jnt_range"):
         rows, kind = getattr(model, name), name.partition("_")[0]
         most = FARTHEST_RANGE if name == "jnt_range" else FARTHEST_M
         wrong = ~(np.abs(rows) <= most).all(axis=1)
@@ -294,8 +297,12 @@ def visible_geoms(
             full = name if len(parts) == 1 else f"{name} {label or number}"
             shape, pose = _piece(model, full, own, clip_m)
             pieces.append(ModelGeom(full, name, label, body, shape, pose))
-    meshes = ((piece.name, piece.shape) for piece in pieces if isinstance(piece.shape, Mesh))
-    notes += [type(note)(f"{name}: {note}") for name, mesh in meshes for note in mesh.notes]
+    notes += [
+        type(note)(f"{piece.name}: {note}")
+        for piece in pieces
+        if isinstance(piece.shape, Mesh)
+        for note in piece.shape.notes
+    ]
     if model.nflex or model.nskin:
         notes.append(f"flexible bodies and skins are left out: {model.nflex + model.nskin}")
     return tuple(pieces), tuple(notes)
@@ -324,14 +331,17 @@ def seen_geoms(model: mujoco.MjModel, groups: Sequence[int] | None = None) -> tu
         double = collides & (bodies > 0) & np.isin(bodies, bodies[~collides]) & ~np.isin(places, places[~collides])
         chosen = chosen[~double]
         if double.any():
-            left_out = f"collision shapes are left out where their body has visual ones: {double.sum()}"
-            notes.append(BackgroundNote(left_out))
+            notes.append(
+                BackgroundNote(f"collision shapes are left out where their body has visual ones: {double.sum()}")
+            )
     if not len(chosen):
         used = ", ".join(str(group) for group in np.unique(model.geom_group[alpha > 0]))
         raise DataError(
             "the model has no visible geoms",
             allowed=used and f"groups that it uses: {used}",
-            hint=f"--set 'groups=[{used}]' (task mujoco)" if used else "give the model that includes this part",
+            hint=f"--set 'groups=[{used}]' (task mujoco)"
+            if used
+            else "give the model that includes this part, or shapes with alpha",
         )
     return chosen, notes
 
@@ -422,10 +432,11 @@ def _documents(path: Path, folder: Path | None) -> tuple[tuple[FileState, ...], 
         found = (own / directory / name).resolve()
         if not found.is_relative_to(allowed):
             wider = quote(f"folder={os.path.commonpath([own, found])}")
-            hint = f"--set {wider} (task mujoco), or copy it into the model's folder"
-            what = f"reads {(Path(directory) / name).as_posix()!r}, which is outside the model's folder"
-            gone = "it is not on this machine: copy it into the model's folder, and correct its name"
-            raise DataError(what, where=str(path), hint=hint if found.exists() else gone)
+            raise DataError(
+                f"reads {(Path(directory) / name).as_posix()!r}, which is outside the model's folder", where=str(path),
+                hint=f"--set {wider} (task mujoco), or copy it into the model's folder" if found.exists() else
+                "it is not on this machine: copy it into the model's folder, and correct its name",
+            )  # fmt: skip
         return found
 
     for document in documents:  # grows while included files are found
@@ -442,9 +453,11 @@ def _documents(path: Path, folder: Path | None) -> tuple[tuple[FileState, ...], 
         if root.tag == "robot":
             parts = [element for part in root if part.tag != "gazebo" for element in part.iter()]
             if any(re.search(r"^xacro:|\$[{(]", " ".join((one.tag, *one.attrib.values()))) for one in parts):
-                files = f"{quote(str(path))} > {quote(str(path.with_suffix('.plain.urdf')))}"
-                hint = f"xacro {files} (pip install xacro, or ROS), and give that file"
-                raise DataError("is xacro: run xacro first", where=str(path), hint=hint)
+                raise DataError(
+                    "is xacro: run xacro first", where=str(path),
+                    hint=f"xacro {quote(str(path))} > {quote(str(path.with_suffix('.plain.urdf')))} (pip install "
+                    "xacro, or ROS), and give that file",
+                )  # fmt: skip
             _settle_urdf(root, own, allowed)
         for element in root.iter():
             directories |= {element.get(name, "") for name in DIRECTORIES if element.tag == "compiler"}
@@ -553,17 +566,18 @@ def _unread_notes(root: ElementTree.Element, path: Path) -> list[str]:
     Raises:
         DataError: No shape is left.
     """
-    own, unread = path.resolve().parent, [mesh for mesh in root.iter(UNREAD) if "filename" in mesh.attrib]
-    files = [(own / mesh.attrib["filename"]).resolve() for mesh in unread if not _is_readable(mesh)]
+    files = [
+        path.resolve().parent / mesh.attrib["filename"]
+        for mesh in root.iter(UNREAD)
+        if "filename" in mesh.attrib and not _is_readable(mesh)
+    ]
     if not files:
         return []
     links = {link.get("name", ""): {shape.tag for shape in link} for link in root.iterfind("link")}
     bare = ", ".join(name for name, tags in links.items() if UNREAD in tags and not tags & SHAPES)
-    folder = os.path.commonpath([file.parent for file in files if file.is_file()] or [own])
-    hint = _conversion(folder, f"*{files[0].suffix}")
+    folders = [file.resolve().parent for file in files if file.is_file()] or [path.resolve().parent]
+    what, hint = f"MuJoCo reads no {files[0].suffix}", _conversion(os.path.commonpath(folders), f"*{files[0].suffix}")
     if not any(tags & SHAPES for tags in links.values()):
-        raise DataError(f"MuJoCo reads no {files[0].suffix}, and there is no other shape", where=str(path), hint=hint)
-    note = (
-        f"{path.name}: MuJoCo reads no {files[0].suffix}, so rays meet other shapes of links, as those for collisions"
-    )
-    return [f"{note}; links without any: {bare or 'none'}; to read them: {hint}"]
+        raise DataError(f"{what}, and no other shape is left", where=str(path), hint=hint)
+    instead = f"rays meet other shapes of links, as those for collisions; links without any: {bare or 'none'}"
+    return [f"{path.name}: {what}, so {instead}; to read them: {hint}"]
