@@ -92,7 +92,7 @@ def write_mjcf(
         sites = [EXPORTED.fullmatch(one.get("name", "")) for one in model.iter("site")]
         taken += [one.get("name", "") for one in model.iter("body")] + [one.group(1) for one in sites if one]
         notes += [
-            *said,
+            *(line.partition(": ")[2] for line in said),
             "geoms of the robot that are not shown are transparent, since MuJoCo's rays pass through no others",
         ]
     names = distinct([xml_text(one.sensor.name) for one in mounted], " ", taken=taken)
