@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from lidardesign.density.fields.distance import build_field
 from lidardesign.errors import DataError
 from lidardesign.scenes.casting import SceneCaster
-from lidardesign.scenes.mujoco_models import PNG_BEGINNING, bodies_from_mujoco, load_model, visible_geoms
+from lidardesign.scenes.mujoco_models import PNG_BEGINNING, bodies_from_mujoco, load_model, model_files, visible_geoms
 from lidardesign.scenes.scene import Cylinder, Mesh, Plane, Scene, Sphere
 from lidardesign.scenes.surface import sample_body
 from lidardesign.space import DesignSpace
@@ -179,7 +179,7 @@ def test_poses_and_groups_that_a_model_does_not_have_are_refused():
     for qpos in (np.zeros(3), np.full((2, 7), np.nan), np.zeros((0, 7))):
         with pytest.raises(DataError, match=r"\(frames, 7\)"):
             bodies_from_mujoco(model, qpos)
-    with pytest.raises(DataError, match="groups that it uses: 0"):
+    with pytest.raises(DataError, match=r"(?s)groups that it uses: 0.*--set 'groups=\[0\]'"):
         bodies_from_mujoco(model, model.qpos0, groups=[4])
 
 
@@ -205,7 +205,50 @@ def test_a_urdf_finds_the_meshes_of_its_package_and_shows_its_visual_shapes(tmp_
     path.write_text(URDF.replace(".obj", ".dae"))
     model, notes = load_model(path)
     assert [part.body_name for part in bodies_from_mujoco(model, [0.3])] == ["tip"]
-    assert "visual shapes are discarded" in notes[0]
+    assert "reads no .dae" in notes[0]
+    assert "links without any: base; to read them: python -c" in notes[0]
+    path.write_text(URDF.replace(".obj", ".dae").replace("collision", "other"))
+    assert [part.body_name for part in bodies_from_mujoco(load_model(path)[0], [0.3])] == ["tip"]
+    path.write_text(URDF.replace("sphere", 'mesh filename="n.dae"').replace("collision", "other"))
+    path.write_text(path.read_text().replace(".obj", ".dae"))
+    with pytest.raises(DataError, match="no other shape is left"):
+        load_model(path)
+
+
+@pytest.mark.parametrize("name", ["package://r/meshes/m.obj", "model://r/meshes/m.obj", "file://{}/meshes/m.obj"])
+def test_a_mesh_is_found_by_every_kind_of_name_and_the_hint_names_the_folder_that_holds_it(tmp_path, name):
+    for folder in ("r/urdf", "r/meshes", "other/meshes"):
+        (tmp_path / folder).mkdir(parents=True)
+    path = tmp_path / "r" / "urdf" / "r.urdf"
+    path.write_text(URDF.replace("package://r/meshes/m.obj", name.format(tmp_path / "r")))
+    (tmp_path / "r" / "meshes" / "m.obj").write_text(TETRAHEDRON)
+    with pytest.raises(DataError, match="outside the model's folder") as refused:
+        load_model(path)
+    assert f"--set folder={tmp_path / 'r'} " in str(refused.value)
+    assert load_model(path, folder=tmp_path / "r")[0].nmesh == 1
+    # a file of the same name in another package is another file
+    (tmp_path / "other" / "meshes" / "m.obj").write_text(TETRAHEDRON.replace("1", "2").replace("f 2 3 2", "f 1 3 2"))
+    path.write_text(URDF.replace("package://r", "package://other"))
+    assert model_files(path, tmp_path)[1][0] == str(tmp_path / "other" / "meshes" / "m.obj")
+
+
+MASSLESS = {
+    "a flat mesh": '<geom type="mesh" mesh="flat" contype="0" conaffinity="0"/>',
+    "a body without mass": '<geom size="1" mass="0"/>',
+    "a body without shapes": "<body name='frame'><joint/></body><geom size='1'/>",
+    "an inertia that no body has": '<inertial pos="0 0 0" mass="1" diaginertia="9 1 1"/><geom size="1"/>',
+}
+
+
+@pytest.mark.parametrize("case", MASSLESS)
+def test_masses_that_mujoco_refuses_are_replaced_with_a_note(tmp_path, case):
+    (tmp_path / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3\nf 1 3 4\n")
+    asset = '<asset><mesh name="flat" file="flat.obj"/></asset>' if "flat" in case else ""
+    body = f'<worldbody><body name="b"><joint/>{MASSLESS[case]}</body></worldbody>'
+    (tmp_path / "m.xml").write_text(f"<mujoco>{asset}{body}</mujoco>")
+    model, (note,) = load_model(tmp_path / "m.xml")
+    assert "m.xml: MuJoCo refuses its masses (" in note
+    assert len(visible_geoms(model)[0]) == 1
 
 
 def test_a_range_that_ends_below_its_start_is_told(tmp_path):
@@ -219,7 +262,15 @@ def test_a_range_that_ends_below_its_start_is_told(tmp_path):
 BAD = {
     "a missing file": (None, "cannot be read"),
     "no XML": ("hello", "is not XML"),
-    "another format": ("<sdf/>", "its root element is <sdf>"),
+    "another format": ("<sdf/>", "its root element is <sdf>.*sdf2mjcf"),
+    "macros": ('<robot><xacro:include filename="a"/></robot>', "run xacro first.*xacro .*robot.xml > "),
+    "macros in names": (URDF.replace("package://r", "$(find r)"), "run xacro first"),
+    "a mesh of another machine": (URDF.replace("package://", "/nowhere/"), "it is not on this machine"),
+    "a mesh that is text": (
+        '<mujoco><asset><mesh file="words.stl"/></asset></mujoco>',
+        "trimesh.load_mesh.*rglob..words.stl",
+    ),
+    "a pointer": ('<mujoco><asset><mesh file="pointer.obj"/></asset></mujoco>', "git lfs pull"),
     "a file outside": ('<mujoco><asset><mesh file="../m.obj"/></asset></mujoco>', "outside the model's folder"),
     "a folder outside": ('<mujoco><compiler meshdir="/etc"/></mujoco>', "outside the model's folder"),
     "an unknown joint": (
@@ -292,6 +343,8 @@ def test_a_file_that_is_no_model_is_refused_with_its_name(tmp_path, case):
     path = tmp_path / "robot.xml"
     if text is not None:
         path.write_text(text)
+    (tmp_path / "words.stl").write_text("solid\n" + "facet normal 0 0 1\n" * 20)
+    (tmp_path / "pointer.obj").write_text("version https://git-lfs.github.com/spec/v1\n")
     (tmp_path / "huge.png").write_bytes(PNG_BEGINNING + b"\0\0\0\rIHDR" + 2 * (30_000).to_bytes(4, "big"))
     with pytest.raises(DataError, match=f"(?s){message}") as refused:
         load_model(path)

@@ -11,12 +11,12 @@ left out. Without joints bodies have the initial poses of a simulation.
 
 from __future__ import annotations
 
+import os
 import re
 import xml.etree.ElementTree as ElementTree
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import takewhile
 from pathlib import Path
 
 import numpy as np
@@ -180,9 +180,8 @@ def read_mjcf(path: Path) -> Rig:
                 allowed=f"at most {FARTHEST_M:g} m along each axis",
             )
     groups = _groups(rays)
-    notes = []
-    if any(ray.start_m is None for ray in rays):
-        notes.append("the file does not say where gates start: rangefinders listen from 0 m")
+    unknown = any(ray.start_m is None for ray in rays)
+    notes = ["the file does not say where gates start: rangefinders listen from 0 m"] * unknown
     sensors_of_body = Counter(rays[group[0]].body for group in groups)
     sensors = []
     for group in groups:
@@ -207,47 +206,40 @@ def _rays(stripped: ElementTree.Element, path: Path) -> list[_Ray]:
     except ValueError as error:
         reason = " ".join(str(error).split()) or "no reason given"
         raise DataError(f"MuJoCo cannot read it: {reason}", where=str(path), allowed=ALLOWED) from None
-    rays = []
-    for index in np.flatnonzero(model.sensor_type == int(mujoco.mjtSensor.mjSENS_RANGEFINDER)):
-        site = int(model.sensor_objid[index])
-        body = int(model.site_bodyid[site])
-        rays.append(
-            _Ray(
-                name=model.sensor(int(index)).name or model.site(site).name,
-                site_name=model.site(site).name,
-                body=body,
-                body_name=model.body(body).name,
-                origin_m=np.array(data.site_xpos[site]),
-                direction=np.array(data.site_xmat[site]).reshape(3, 3)[:, 2],
-                cutoff_m=float(model.sensor_cutoff[index]) or np.inf,
-                user=tuple(float(value) for value in model.sensor_user[index]),
-            )
+    index = np.flatnonzero(model.sensor_type == int(mujoco.mjtSensor.mjSENS_RANGEFINDER))
+    sites = model.sensor_objid[index]
+    return [
+        _Ray(
+            name=model.sensor(sensor).name or model.site(site).name,
+            site_name=model.site(site).name,
+            body=body,
+            body_name=model.body(body).name,
+            origin_m=np.array(data.site_xpos[site]),
+            direction=np.array(data.site_xmat[site]).reshape(3, 3)[:, 2],
+            cutoff_m=float(model.sensor_cutoff[sensor]) or np.inf,
+            user=tuple(float(value) for value in model.sensor_user[sensor]),
         )
-    return rays
+        for sensor, site, body in zip(index.tolist(), sites.tolist(), model.site_bodyid[sites].tolist(), strict=True)
+    ]
 
 
 def _groups(rays: Sequence[_Ray]) -> list[list[int]]:
     """Indices of the rays of each sensor, grouped by body and origin, in order of appearance."""
     groups: list[list[int]] = []
-    # groups by body and cell of their first ray
-    near: dict[tuple[int, ...], list[list[int]]] = {}
-    exported: dict[tuple[int, str], list[int]] = {}
+    # groups by body and cell of their first ray, or name in an export
+    near: dict[tuple[int, str | tuple[int, ...]], list[list[int]]] = {}
     for index, ray in enumerate(rays):
-        if ray.exported is not None:
-            exported.setdefault((ray.body, ray.exported), []).append(index)
-            if exported[ray.body, ray.exported] == [index]:
-                groups.append(exported[ray.body, ray.exported])
-            continue
         cell = np.floor(ray.origin_m / SAME_PLACE_M).astype(np.int64)
-        around = [(ray.body, *(cell + np.array(step) - 1).tolist()) for step in np.ndindex(3, 3, 3)]
-        candidates = (group for key in around for group in near.get(key, []))
-        same = (group for group in candidates if np.linalg.norm(rays[group[0]].origin_m - ray.origin_m) <= SAME_PLACE_M)
-        group = next(same, None)
-        if group is not None:
-            group.append(index)
-            continue
-        groups.append([index])
-        near.setdefault((ray.body, *cell.tolist()), []).append(groups[-1])
+        home = ray.exported or tuple((cell + 1).tolist())
+        places = [home] if ray.exported else [tuple((cell + step).tolist()) for step in np.ndindex(3, 3, 3)]
+        candidates = (group for place in places for group in near.get((ray.body, place), []))
+        apart_m = ((group, np.linalg.norm(rays[group[0]].origin_m - ray.origin_m)) for group in candidates)
+        group = next((group for group, way_m in apart_m if ray.exported or way_m <= SAME_PLACE_M), None)
+        if group is None:
+            group = []
+            groups.append(group)
+            near.setdefault((ray.body, home), []).append(group)
+        group.append(index)
     return groups
 
 
@@ -257,8 +249,5 @@ def _name(own: Sequence[_Ray], *, alone: bool) -> str:
         return own[0].exported
     if len(own) == 1 and own[0].name:
         return own[0].name
-    names = [ray.name for ray in own]
-    # the common prefix of the first and the last in order is that of all
-    pairs = takewhile(lambda letters: letters[0] == letters[1], zip(min(names), max(names), strict=False))
-    common = COUNTED.sub("", "".join(letter for letter, _ in pairs))
+    common = COUNTED.sub("", os.path.commonprefix([ray.name for ray in own]))  # noqa: RUF071 (of letters)
     return common or (own[0].body_name if alone and own[0].body else "")

@@ -88,12 +88,13 @@ def write_mjcf(
     place, sensors, notes = element("worldbody"), element("sensor"), design_losses(design, mounted)
     model, taken = element("mujoco", {"model": design.name}, [place, sensors]), [WORLD]
     if robot is not None:
-        model, place, sensors = _robot_with(design.mount, robot, path)
+        model, place, sensors, said = _robot_with(design.mount, robot, path)
         sites = [EXPORTED.fullmatch(one.get("name", "")) for one in model.iter("site")]
         taken += [one.get("name", "") for one in model.iter("body")] + [one.group(1) for one in sites if one]
-        notes.append(
-            "geoms of the robot that are not shown are transparent, since MuJoCo's rays pass through no others"
-        )
+        notes += [
+            *(line.partition(": ")[2] for line in said),
+            "geoms of the robot that are not shown are transparent, since MuJoCo's rays pass through no others",
+        ]
     names = distinct([xml_text(one.sensor.name) for one in mounted], " ", taken=taken)
     site = np.empty(len(rays), dtype=object)
     for mount, name in zip(mounted, names, strict=True):
@@ -120,10 +121,10 @@ def write_mjcf(
     ]
 
 
-def _robot_with(mount: str | None, robot: RobotFile, path: Path) -> tuple[Element, Element, Element]:
-    """A robot's model as MuJoCo writes it to a path, its body that receives the sensors, and its <sensor> element."""
+def _robot_with(mount: str | None, robot: RobotFile, path: Path) -> tuple[Element, Element, Element, tuple[str, ...]]:
+    """A robot's model as MuJoCo writes it to a path, its body that receives the sensors, its <sensor>, and notes."""
     specifications: list[Any] = []
-    model, _ = load_model(robot.path, folder=robot.folder, edit=specifications.append)
+    model, said = load_model(robot.path, folder=robot.folder, edit=specifications.append)
     seen = set(seen_geoms(model, robot.groups)[0].tolist())
     # the class of a geom may have a material, whose transparency counts more than the geom's own colour
     if all(material.name != UNSEEN for material in specifications[0].materials):
@@ -145,9 +146,12 @@ def _robot_with(mount: str | None, robot: RobotFile, path: Path) -> tuple[Elemen
     bodies = {body.get("name", ""): body for body in root.iter("body")}
     place = next(root.iter("worldbody")) if mount is None else bodies.get(mount)
     if place is None:
-        close = ", ".join(get_close_matches(str(mount), bodies, 3, 0.0))
-        raise DataError(f"has no body {mount!r}, which the design is mounted on", where=str(robot.path), allowed=close)
-    return root, place, sensors
+        raise DataError(
+            f"has no body {mount!r}, which the design is mounted on",
+            where=str(robot.path),
+            allowed=", ".join(get_close_matches(str(mount), bodies, 3, 0.0)),
+        )
+    return root, place, sensors, said
 
 
 def _body(mount: Mount, name: str, rays: Rays, sites: np.ndarray) -> Element:
@@ -287,8 +291,11 @@ def _base() -> list[Element]:
         "inertial", children=[element("mass", {"value": numbers([BASE_MASS_KG])}), element("inertia", moments)]
     )
     ends = [element("parent", {"link": WORLD}), element("child", {"link": BASE})]
-    joint = element("joint", {"name": f"{WORLD}_joint", "type": "fixed"}, ends)
-    return [element("link", {"name": WORLD}), element("link", {"name": BASE}, [inertial]), joint]
+    return [
+        element("link", {"name": WORLD}),
+        element("link", {"name": BASE}, [inertial]),
+        element("joint", {"name": f"{WORLD}_joint", "type": "fixed"}, ends),
+    ]
 
 
 def mounted_parts(mount: Mount, rate_hz: float, *, parent: str, prefix: str = "") -> list[Element]:

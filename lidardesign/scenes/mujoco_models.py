@@ -5,7 +5,9 @@ MuJoCo is imported when a model is read. A model may only read files of its own 
 
 from __future__ import annotations
 
+import math
 import os
+import re
 import warnings
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -13,6 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -49,6 +52,24 @@ PRIMITIVES: dict[str, Callable[[float, float, float], Shape]] = {
     "ellipsoid": lambda *semi_axes_m: Ellipsoid(semi_axes_m),
 }
 ALLOWED = "an MJCF or URDF model that MuJoCo can load"
+# What to do about a model that MuJoCo refuses, by words of its reason.
+ADVICE = {
+    "opening file": "put it there, or correct its name: upper and lower case differ; package:// is looked for in the "
+    "model's folder and those above it",
+    "area is too small": "leave the mesh out, which is a line or a point",
+    "coplanar": "take the flat mesh out of collisions: no <collision> in a URDF, contype and conaffinity 0 in an MJCF",
+    "content type": "convert the texture to PNG, or leave it out: rays see no textures",
+    "eigenvalues": "correct its inertia, or leave it out",
+    "invalid header": "of a pointer of Git LFS: git lfs pull; else write the mesh again",
+    "is empty": "write the mesh again",
+    "keyframe": "correct the keyframe, or leave it out",
+    "plugin": "leave the plugin out: only shapes and joints count",
+    "repeated name": "give one of the two another name",
+    "top level": "only a root link may float: make it a root, or fix its joint",
+    "vertices required": "of a pointer of Git LFS: git lfs pull; else leave out the mesh, which is empty or a line",
+}
+LEAST_MASS_KG = 1e-6  # and moment of inertia [kg m^2] of bodies whose own MuJoCo refuses
+SHAPES, UNREAD = {"visual", "collision"}, "unread"  # of the links of a URDF
 
 FileState = tuple[str, int, int]
 
@@ -135,6 +156,7 @@ def load_model(
     """
     path = Path(path)
     root = _documents(path, folder)[1]
+    said = _unread_notes(root, path)
     mujoco = import_mujoco()
     with mujoco_warnings() as collected, warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -146,17 +168,46 @@ def load_model(
                 spec = mujoco.MjSpec.from_file(str(path))
             if edit is not None:
                 edit(spec)
-            model = spec.compile()
+            model, changed = _compiled(spec, path)
         except (ValueError, RuntimeError, MemoryError, mujoco.FatalError) as error:
             reason = " ".join(str(error).split())
-            raise DataError(f"MuJoCo cannot read it: {reason}", where=str(path), allowed=ALLOWED) from error
+            mesh = re.search(r"(?:STL|mesh) file '([^']*)/([^'/]+)'", reason)
+            hint = next(
+                (hint for words, hint in ADVICE.items() if words in reason), mesh and _conversion(*mesh.groups())
+            )
+            raise DataError(f"MuJoCo cannot read it: {reason}", where=str(path), allowed=ALLOWED, hint=hint) from error
     _check_places(model, path)
-    if root.find("mujoco/compiler[@discardvisual='true']") is not None:
+    if spec.compiler.discardvisual:
         collected.append("visual shapes are discarded, so rays meet the collision shapes")
-    upside_down = [model.joint(number).name for number, (low, high) in enumerate(model.jnt_range) if low > high]
-    collected += [f"the range of joint {name!r} ends below its start, so it has no limits" for name in upside_down]
+    collected += [
+        f"the range of joint {model.joint(number).name!r} ends below its start, so it has no limits"
+        for number in np.flatnonzero(model.jnt_range[:, 0] > model.jnt_range[:, 1])
+    ]
     lines = dict.fromkeys(" ".join(str(line).split()) for line in (*collected, *(one.message for one in caught)))
-    return model, tuple(f"{path.name}: MuJoCo warns: {line}" for line in lines)
+    return model, (*said, *changed, *(f"{path.name}: MuJoCo warns: {line}" for line in lines))
+
+
+def _compiled(spec: mujoco.MjSpec, path: Path) -> tuple[mujoco.MjModel, list[str]]:
+    """The compiled model, with other masses and a note where MuJoCo refuses its own, which rays do not meet."""
+    try:
+        return spec.compile(), []
+    except ValueError as error:
+        for mesh in spec.meshes:
+            mesh.inertia = import_mujoco().mjtMeshInertia.mjMESH_INERTIA_SHELL
+        spec.compiler.boundmass = spec.compiler.boundinertia = LEAST_MASS_KG
+        spec.compiler.balanceinertia = True
+        reason = " ".join(str(error).split())
+        changed = f"meshes weigh as shells and bodies {LEAST_MASS_KG:g} kg or more, which no ray meets"
+        return spec.compile(), [f"{path.name}: MuJoCo refuses its masses ({reason}): {changed}"]
+
+
+def _conversion(folder: str, pattern: str) -> str:
+    """What to do about meshes that MuJoCo cannot read: a command that converts them."""
+    code = (
+        'import pathlib, trimesh; [trimesh.load_mesh(mesh).export(mesh.with_suffix(".obj")) '
+        f'for mesh in pathlib.Path("{folder}").rglob("{pattern}")]'
+    )
+    return f"python -c {quote(code)} (DAE: after pip install pycollada), and name the OBJ files in the model"
 
 
 def _check_places(model: mujoco.MjModel, path: Path) -> None:
@@ -165,8 +216,7 @@ def _check_places(model: mujoco.MjModel, path: Path) -> None:
     Raises:
         DataError: Such a value, with its body, geom or joint.
     """
-    names = ("body_pos", "body_quat", "geom_pos", "geom_quat", "geom_size", "jnt_pos", "jnt_range")
-    for name in names:
+    for name in ("body_pos", "body_quat", "geom_pos", "geom_quat", "geom_size", "jnt_pos", "jnt_range"):
         rows, kind = getattr(model, name), name.partition("_")[0]
         most = FARTHEST_RANGE if name == "jnt_range" else FARTHEST_M
         wrong = ~(np.abs(rows) <= most).all(axis=1)
@@ -247,8 +297,12 @@ def visible_geoms(
             full = name if len(parts) == 1 else f"{name} {label or number}"
             shape, pose = _piece(model, full, own, clip_m)
             pieces.append(ModelGeom(full, name, label, body, shape, pose))
-    meshes = ((piece.name, piece.shape) for piece in pieces if isinstance(piece.shape, Mesh))
-    notes += [type(note)(f"{name}: {note}") for name, mesh in meshes for note in mesh.notes]
+    notes += [
+        type(note)(f"{piece.name}: {note}")
+        for piece in pieces
+        if isinstance(piece.shape, Mesh)
+        for note in piece.shape.notes
+    ]
     if model.nflex or model.nskin:
         notes.append(f"flexible bodies and skins are left out: {model.nflex + model.nskin}")
     return tuple(pieces), tuple(notes)
@@ -277,11 +331,18 @@ def seen_geoms(model: mujoco.MjModel, groups: Sequence[int] | None = None) -> tu
         double = collides & (bodies > 0) & np.isin(bodies, bodies[~collides]) & ~np.isin(places, places[~collides])
         chosen = chosen[~double]
         if double.any():
-            left_out = f"collision shapes are left out where their body has visual ones: {double.sum()}"
-            notes.append(BackgroundNote(left_out))
+            notes.append(
+                BackgroundNote(f"collision shapes are left out where their body has visual ones: {double.sum()}")
+            )
     if not len(chosen):
-        used = ", ".join(str(group) for group in np.unique(model.geom_group)) or "none"
-        raise DataError("the model has no visible geoms", allowed=f"groups that it uses: {used}")
+        used = ", ".join(str(group) for group in np.unique(model.geom_group[alpha > 0]))
+        raise DataError(
+            "the model has no visible geoms",
+            allowed=used and f"groups that it uses: {used}",
+            hint=f"--set 'groups=[{used}]' (task mujoco)"
+            if used
+            else "give the model that includes this part, or shapes with alpha",
+        )
     return chosen, notes
 
 
@@ -361,18 +422,21 @@ def model_files(path: Path, folder: Path | None = None) -> tuple[FileState, ...]
 
 def _documents(path: Path, folder: Path | None) -> tuple[tuple[FileState, ...], ElementTree.Element]:
     """States as in `model_files`, and the root element of the first file, for a URDF with resolved mesh names."""
-    own, allowed_folder = path.resolve().parent, (folder or path.parent).resolve()
+    own, allowed = path.resolve().parent, (folder or path.parent).resolve()
     documents, assets, directories, roots = [path.resolve()], [], {""}, []
-    if folder is not None and not os.path.isdir(allowed_folder):
+    if folder is not None and not os.path.isdir(allowed):
         raise DataError("is not a folder", where=str(folder), hint="name the folder that holds all files of the model")
 
     def inside(directory: str, name: str) -> Path:
         """Resolved path of a file that the model names; raises DataError outside the allowed folder."""
         found = (own / directory / name).resolve()
-        if not found.is_relative_to(allowed_folder):
-            what = f"reads {(Path(directory) / name).as_posix()!r}, which is outside the model's folder"
-            hint = "copy the file into the model's folder, or say which folder holds all its files"
-            raise DataError(what, where=str(path), hint=hint)
+        if not found.is_relative_to(allowed):
+            wider = quote(f"folder={os.path.commonpath([own, found])}")
+            raise DataError(
+                f"reads {(Path(directory) / name).as_posix()!r}, which is outside the model's folder", where=str(path),
+                hint=f"--set {wider} (task mujoco), or copy it into the model's folder" if found.exists() else
+                "it is not on this machine: copy it into the model's folder, and correct its name",
+            )  # fmt: skip
         return found
 
     for document in documents:  # grows while included files are found
@@ -380,24 +444,37 @@ def _documents(path: Path, folder: Path | None) -> tuple[tuple[FileState, ...], 
             raise DataError(f"includes more than {MAX_INCLUDES} files", where=str(path))
         root = read_xml(document, ALLOWED, most_elements=MOST_ELEMENTS)
         if document == documents[0] and root.tag not in ("mujoco", "robot"):
-            allowed = "<mujoco>, an MJCF model, or <robot>, a URDF model"
-            raise DataError(f"its root element is <{root.tag}>", where=str(path), allowed=allowed)
+            raise DataError(
+                f"its root element is <{root.tag}>", where=str(path),
+                allowed="<mujoco>, an MJCF model, or <robot>, a URDF model",
+                hint="SDF: sdf2mjcf FILE.sdf FILE.xml (pip install sdformat-mjcf); a part: the model that includes it",
+            )  # fmt: skip
         roots.append(root)
         if root.tag == "robot":
-            _settle_urdf(root, own, allowed_folder)
+            parts = [element for part in root if part.tag != "gazebo" for element in part.iter()]
+            if any(re.search(r"^xacro:|\$[{(]", " ".join((one.tag, *one.attrib.values()))) for one in parts):
+                raise DataError(
+                    "is xacro: run xacro first", where=str(path),
+                    hint=f"xacro {quote(str(path))} > {quote(str(path.with_suffix('.plain.urdf')))} (pip install "
+                    "xacro, or ROS), and give that file",
+                )  # fmt: skip
+            _settle_urdf(root, own, allowed)
         for element in root.iter():
             directories |= {element.get(name, "") for name in DIRECTORIES if element.tag == "compiler"}
             names = [value for key, value in element.attrib.items() if key == "file" or key.startswith("file")]
             if element.tag in ("include", "model"):
                 documents += [found for name in names if (found := inside("", name)) not in documents]
             else:
-                assets += [name for name in names if name]
+                # of a URDF MuJoCo reads no textures and plugins
+                is_read = root.tag == "mujoco" or element.tag == "mesh"
+                assets += [one for one in names if one and (is_read or (own / one).resolve().is_relative_to(allowed))]
     if len(directories) > MAX_DIRECTORIES:
         raise DataError(f"names {len(directories)} folders", where=str(path), allowed=f"at most {MAX_DIRECTORIES}")
     found = {inside(directory, name) for directory in directories for name in ["", *assets]}
-    states = tuple(_state(file) for file in [*documents, *sorted(found)] if file.exists() and not file.is_dir())
+    files = [file for file in (*documents, *sorted(found)) if file.exists() and not file.is_dir()]
+    states = tuple((str(file), file.stat().st_mtime_ns, check_file(file, ROBOT_FILES)) for file in files)
     check_bytes(sum(size for _, _, size in states), ROBOT_FILES, str(path))
-    _check_growth(roots, {Path(name) for name, _, _ in states}, path)
+    _check_growth(roots, set(files), path)
     return states, roots[0]
 
 
@@ -430,9 +507,8 @@ def _check_growth(roots: Sequence[ElementTree.Element], files: Collection[Path],
 
 def _expanded(element: ElementTree.Element) -> int:
     """Number of elements that one expands to: itself and its descendants, times its repetitions."""
-    times = 1
-    for count in element.get("count", "1").split() if element.tag in REPEATING else ():
-        times *= max(int(count), 1) if count.isdecimal() and len(count) < 12 else 1
+    counts = element.get("count", "").split() if element.tag in REPEATING else []
+    times = math.prod(max(int(count), 1) for count in counts if count.isdecimal() and len(count) < 12)
     return times * (1 + sum(map(_expanded, element)))
 
 
@@ -449,25 +525,59 @@ def _pixels(path: Path) -> int:
 
 
 def _settle_urdf(root: ElementTree.Element, own: Path, folder: Path) -> None:
-    """Keep the visual shapes and all links of a URDF, and resolve package:// meshes relative to its own folder."""
+    """Keep all links of a URDF and the visual shapes that MuJoCo can read, and resolve meshes relative to its folder.
+
+    Where it cannot read a visual shape, those of all links with collision shapes become `UNREAD`: rays meet one kind.
+    """
     extension = root.find("mujoco")
     extension = ElementTree.SubElement(root, "mujoco") if extension is None else extension
     compiler = extension.find("compiler")
     compiler = ElementTree.SubElement(extension, "compiler") if compiler is None else compiler
-    names = [mesh.get("filename", "") for mesh in root.iterfind("link/visual/geometry/mesh")]
-    readable = all(name.lower().endswith(MESH_ENDINGS) for name in names)
-    for name, value in (("discardvisual", not readable), ("fusestatic", False), ("strippath", False)):
-        compiler.attrib.setdefault(name, str(value).lower())
+    for name in ("discardvisual", "fusestatic", "strippath"):
+        compiler.attrib.setdefault(name, "false")
     for mesh in root.iter("mesh"):
-        _, package, name = mesh.get("filename", "").partition("package://")
-        bases = [base for base in (own, *own.parents) if base.is_relative_to(folder)]
-        places = [base / name.partition("/")[2] for base in bases] if package else []
-        found = next((place for place in places if place.is_file()), None)
-        if found is not None:
-            mesh.set("filename", os.path.relpath(found, own))
+        scheme, _, name = mesh.get("filename", "").partition("://")
+        package, _, inner = name.partition("/")
+        bases = [own, *own.parents] if scheme in ("package", "model") else []
+        # in the package, whose folder may have another name
+        places = [base / inner for base in bases if base.name == package]
+        places += [base / part for part in (name, inner) for base in bases]
+        places = sorted(filter(os.path.isfile, places), key=lambda place: not place.is_relative_to(folder))
+        if scheme == "file" or places:
+            mesh.set("filename", os.path.relpath(places[0], own) if places else name)
+    links = list(root.iterfind("link"))
+    readable = {shape for link in links for shape in link if all(map(_is_readable, shape.iter("mesh")))}
+    blind = not readable.issuperset(root.iterfind("link/visual"))
+    solid = {link for link in links if blind and not readable.isdisjoint(link.iterfind("collision"))}
+    hidden = {shape for link in solid for shape in link.iterfind("visual")}
+    for element in [
+        one for link in links for shape in link if shape in hidden or shape not in readable for one in shape.iter()
+    ]:
+        element.tag = UNREAD
 
 
-def _state(path: Path) -> FileState:
-    check_file(path, ROBOT_FILES)
-    state = path.stat()
-    return str(path), state.st_mtime_ns, state.st_size
+def _is_readable(mesh: ElementTree.Element) -> bool:
+    return mesh.get("filename", "").lower().endswith(MESH_ENDINGS)
+
+
+def _unread_notes(root: ElementTree.Element, path: Path) -> list[str]:
+    """Notes on what `_settle_urdf` leaves out of a URDF.
+
+    Raises:
+        DataError: No shape is left.
+    """
+    files = [
+        path.resolve().parent / mesh.attrib["filename"]
+        for mesh in root.iter(UNREAD)
+        if "filename" in mesh.attrib and not _is_readable(mesh)
+    ]
+    if not files:
+        return []
+    links = {link.get("name", ""): {shape.tag for shape in link} for link in root.iterfind("link")}
+    bare = ", ".join(name for name, tags in links.items() if UNREAD in tags and not tags & SHAPES)
+    folders = [file.resolve().parent for file in files if file.is_file()] or [path.resolve().parent]
+    what, hint = f"MuJoCo reads no {files[0].suffix}", _conversion(os.path.commonpath(folders), f"*{files[0].suffix}")
+    if not any(tags & SHAPES for tags in links.values()):
+        raise DataError(f"{what}, and no other shape is left", where=str(path), hint=hint)
+    instead = f"rays meet other shapes of links, as those for collisions; links without any: {bare or 'none'}"
+    return [f"{path.name}: {what}, so {instead}; to read them: {hint}"]

@@ -19,6 +19,7 @@ from support.robots import written
 from lidardesign.config import resolve, save_run_config
 from lidardesign.contract import contract_of
 from lidardesign.contract.contract import LAWS
+from lidardesign.density.training.learn import prepare_training_data
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.rays.information import require_valid
 from lidardesign.registry import load_task
@@ -344,6 +345,25 @@ def test_a_configuration_that_cannot_be_used_says_what_to_do(configured, case):
         TASK.scenes(configured(**keys), "train", 0)
     assert said in str(error.value)
     assert "task." in str(error.value.where)
+
+
+def test_links_without_a_shape_that_can_be_read_are_named_before_anything_is_learned(tmp_path):
+    ball = '<visual><geometry><sphere radius=".1"/></geometry></visual>'
+    mesh = '<visual><geometry><mesh filename="t.dae"/></geometry></visual>'
+    links = f'<link name="base">{ball}</link><link name="arm">{ball}</link><link name="tip">{mesh}</link>'
+    joints = "".join(
+        f'<joint name="{child}" type="revolute"><parent link="{parent}"/><child link="{child}"/>'
+        '<origin xyz="0 0 .4"/><axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>'
+        for parent, child in (("base", "arm"), ("arm", "tip"))
+    )
+    text = f'<robot name="r">{links}{joints}</robot>'
+    keys = [f"model={written(tmp_path, text, 'r.urdf')}", "train=2", "test=2", "frames=3"]
+    with pytest.raises(ConfigError, match=r"(?s)is called 'tip'.*links without any: tip"):
+        resolve(TASK, overrides=[*keys, "targets=tip"])
+    said = []
+    prepare_training_data(TASK, resolve(TASK, overrides=[*keys, "targets=arm"]), said.append)
+    assert any("links without any: tip" in note for note in said)
+    assert any("refuses its masses" in note for note in said)
 
 
 def test_what_passes_through_a_sensor_is_no_error_and_what_stays_there_is(configured):

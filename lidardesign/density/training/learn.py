@@ -116,7 +116,7 @@ def prepare_training_data(task: Task, config: RunConfig, remark: Callable[[str],
     Arguments:
         task: The plugin.
         config: The resolved configuration.
-        remark: Called with notes on lengths as soon as there are scenes; they are in the notes too.
+        remark: Called with notes of scenes and on lengths as soon as there are scenes; they are in the notes too.
 
     Raises:
         ConfigError, DataError: Unusable settings or scenes.
@@ -132,7 +132,7 @@ def prepare_training_data(task: Task, config: RunConfig, remark: Callable[[str],
         task_notes = notes_of(task, config.task, config.space)
     scenes = training_scenes(task, config)
     of_lengths = scale_notes(scenes, config)
-    for line in of_lengths if remark else ():
+    for line in dict.fromkeys((*of_lengths, *(line for scene in scenes for line in scene.notes))) if remark else ():
         remark(line)
     target, notes = prepare_target(scenes, config)
     with phase("proposals"):

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lidardesign.errors import ConfigError
+from lidardesign.errors import BackgroundNote, ConfigError
 from lidardesign.numerics import SLACK
 from lidardesign.run.validation import suggest
 from lidardesign.scenes.casting import SceneCaster
@@ -127,9 +127,10 @@ def _read(path: Path, folder: Path | None, states: tuple[FileState, ...], target
     """Read a model; `states` of its files are part of the cache key, so that a changed model is read again."""
     model, said = load_model(path, folder=folder)
     pieces, notes = visible_geoms(model, groups=groups)
-    gone = _named(pieces, ignored, "ignored")
+    missing = [note for note in (*said, *notes) if not isinstance(note, BackgroundNote)]
+    gone = _named(pieces, ignored, "ignored", missing)
     pieces = tuple(without_notes(piece) for piece, left_out in zip(pieces, gone, strict=True) if not left_out)
-    wanted = _named(pieces, targets, "targets")
+    wanted = _named(pieces, targets, "targets", missing)
     names = [model.body(body).name for body in range(model.nbody)]
     if mount is not None and mount not in names[1:]:
         raise ConfigError(f"no body is called {mount!r}", where="task.mount_body", allowed=listed(names[1:]),
@@ -142,7 +143,7 @@ def _read(path: Path, folder: Path | None, states: tuple[FileState, ...], target
     if any(target.body == number for target in found):
         raise ConfigError(f"{mount!r}, which sensors are on, is a target", where="task.targets",
                           hint="targets on other bodies, or another mount_body")  # fmt: skip
-    told_apart = _named(pieces, known, "known")
+    told_apart = _named(pieces, known, "known", missing)
     if known and not (told_apart & ~wanted).any() and not wanted.all():
         raise ConfigError("all known pieces are targets", where="task.known",
                           allowed="names of other bodies or geoms, [*] for all of them, [] for none")  # fmt: skip
@@ -150,8 +151,8 @@ def _read(path: Path, folder: Path | None, states: tuple[FileState, ...], target
     return Model(model, pieces, tuple(found), told_apart, number, (*said, *notes))
 
 
-def _named(pieces: Sequence[ModelGeom], patterns: Names, key: str) -> np.ndarray:
-    """Mask of pieces whose body or geom matches a pattern, shape (pieces,)."""
+def _named(pieces: Sequence[ModelGeom], patterns: Names, key: str, missing: Sequence[str]) -> np.ndarray:
+    """Mask of pieces whose body or geom matches a pattern, shape (pieces,); `missing` tells what the model lacks."""
     found, names = np.zeros(len(pieces), dtype=bool), [(piece.body_name, piece.geom_name) for piece in pieces]
     for pattern in patterns:
         fits = np.array([fnmatchcase(body, pattern) or fnmatchcase(geom, pattern) for body, geom in names], dtype=bool)
@@ -161,7 +162,7 @@ def _named(pieces: Sequence[ModelGeom], patterns: Names, key: str) -> np.ndarray
             last = next((body for body, _ in names[::-1] if body), every[-1])
             hint = suggest(pattern.strip("*"), every) or f"the last body is {last!r}"
             raise ConfigError(f"no visible body or geom is called {pattern!r}", where=f"task.{key}",
-                              allowed=listed(every), hint=hint)  # fmt: skip
+                              allowed=listed(every), hint="; ".join((hint, *missing)))  # fmt: skip
         found |= fits
     return found
 
