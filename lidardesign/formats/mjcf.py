@@ -180,8 +180,9 @@ def read_mjcf(path: Path) -> Rig:
                 allowed=f"at most {FARTHEST_M:g} m along each axis",
             )
     groups = _groups(rays)
-    unknown = any(ray.start_m is None for ray in rays)
-    notes = ["the file does not say where gates start: rangefinders listen from 0 m"] * unknown
+    notes = []
+    if any(ray.start_m is None for ray in rays):
+        notes.append("the file does not say where gates start: rangefinders listen from 0 m")
     sensors_of_body = Counter(rays[group[0]].body for group in groups)
     sensors = []
     for group in groups:
