@@ -249,7 +249,9 @@ def _cluster(address: str, task: Task) -> Iterator[tuple[Submit, Callable[[], in
         # many rays make a long message, which is short compared with their simulation
         warnings.filterwarnings("ignore", "Sending large graph", UserWarning)
         try:
-            _answered(lambda: asyncio.run(_greet(address)))
+            # nothing may ever come from what listens there; a notebook's own loop runs in this thread
+            with ThreadPoolExecutor(1) as thread:
+                thread.submit(asyncio.run, asyncio.wait_for(_greet(address), 1.5 * SCHEDULER_SECONDS)).result()
             client = Client(address, timeout=SCHEDULER_SECONDS, set_as_default=False)
         except Exception as error:
             # what is no OSError comes of bytes that are not a scheduler's
@@ -296,23 +298,3 @@ async def _greet(address: str) -> None:
     await comm.write({"op": "identity", "reply": True})
     await comm.read()
     comm.abort()
-
-
-def _answered(connect: Callable[[], Any]) -> Any:
-    """Result of a connection with a time limit: nothing may ever come from what listens there.
-
-    Raises:
-        TimeoutError: No answer in time.
-    """
-    answer: Future[Any] = Future()
-
-    def work() -> None:
-        try:
-            answer.set_result(connect())
-        except Exception as error:
-            # raised in the calling thread
-            answer.set_exception(error)
-
-    threading.Thread(target=work, daemon=True).start()
-    # the client's own time limit comes first where nothing listens
-    return answer.result(1.5 * SCHEDULER_SECONDS)
