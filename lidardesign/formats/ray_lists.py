@@ -323,7 +323,6 @@ def read_sensor_csv(path: Path) -> DesignSpec:
     Raises:
         DataError: The file cannot be read, or a cell cannot be used; with file, line and column (exit 3).
     """
-    path = Path(path)
     rows, notes = _rows(path)
     sensors = [_sensor(row, index, where) for index, (row, where) in enumerate(rows)]
     total = math.fsum(sensor.weight for sensor in sensors)
@@ -461,5 +460,5 @@ def write_sensor_csv(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
             azimuth_sigma, elevation_sigma, (end - start) / (2 * z), sensor.weight,
         ]  # fmt: skip
         table.append([repr(float(value)) for value in row])
-    write_atomic(Path(path), csv_table(table))
+    write_atomic(path, csv_table(table))
     return [*notes, f"the {len(rays)} rays are lost"] if len(rays) else notes

@@ -234,7 +234,6 @@ def write_rgl(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> lis
         DataError: The design has no rays, or the folder cannot be written.
     """
     require_rays(design, rays, "a ray pattern")
-    path = Path(path)
     mounted = mounts(design, rays)
     root = element("sdf", {"version": "1.9"})
     model = child(root, "model", name=identifier(design.name))

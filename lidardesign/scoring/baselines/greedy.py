@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple
 import numpy as np
 
 from lidardesign.numerics import COARSE_SLACK
+from lidardesign.rays.training_scenes import CHOICE, InformedScene, TrainingScenes
 from lidardesign.run.clock import phase
 from lidardesign.scenes.rays import Rays, fire_times
 from lidardesign.scoring.baselines.candidates import rays_at, rays_within, whole_range
@@ -35,7 +36,6 @@ from lidardesign.task import Task
 if TYPE_CHECKING:
     from lidardesign.rays.coverage import Coverage
     from lidardesign.rays.selection import Selection
-    from lidardesign.rays.training_scenes import InformedScene, TrainingScenes
 
 GREEDY = "greedy"
 USUAL_SCENES = 200  # that rays are chosen on where no design has a number of its own
@@ -177,7 +177,6 @@ class GreedyCandidate:
     @cached_property
     def _table(self) -> _Table:
         from lidardesign.rays.selection import Selection
-        from lidardesign.rays.training_scenes import CHOICE
 
         ends = np.cumsum([0, *map(len, self._proposed)]).tolist()
         visits = [slice(*pair) for pair in itertools.pairwise(ends)]

@@ -164,7 +164,7 @@ def load_capture(path: Path) -> Capture:
         DataError: The file cannot be read, a key is missing, unknown or in another unit, or a value cannot be.
     """
     where = str(path)
-    arrays = read_arrays(Path(path))
+    arrays = read_arrays(path)
     for name in arrays:
         if name not in KEYS:
             same = [key for key in KEYS if key.rpartition("_")[0] and name.startswith(key.rpartition("_")[0] + "_")]
@@ -315,7 +315,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     Raises:
         DataError: The file is missing, damaged, too large, or holds something else than arrays of numbers.
     """
-    path, where = Path(path), str(path)
+    where = str(path)
     if path.suffix.lower() not in SUFFIXES:
         raise DataError(f"has the suffix {path.suffix!r}", where=where, allowed=", ".join(SUFFIXES))
     if not check_file(path, CAPTURE, hint="check the path"):
