@@ -272,8 +272,14 @@ def render_transient(
         "baseline": np.zeros(count) + bins.start_m,
         "dark_radius": np.full(count, 0.0 if direct else SAME_PLACE * reach_m),
     }
-    request = {"shapes": shapes, "samples": samples, "bins": bins.count, "width_m": bins.width_m}
-    request |= {"bounces": bounces, "own": own_light}
+    request = {
+        "shapes": shapes,
+        "samples": samples,
+        "bins": bins.count,
+        "width_m": bins.width_m,
+        "bounces": bounces,
+        "own": own_light,
+    }
     light_columns = {
         "light": lights.origin_m - centre_m,
         "light_forward": lights.axes[:, 0],
