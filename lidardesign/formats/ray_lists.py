@@ -266,9 +266,11 @@ def write_csv(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     columns, rule = pattern_columns(design, rays)
     rows = zip(*(column.tolist() for column in columns.values()), strict=True)
     lines = [",".join(columns), *(",".join(map(repr, row)) for row in rows)]
-    for name, values in rule.items():
-        for row in np.atleast_2d(values).tolist():
-            lines.append(f"# {name}: {','.join(map(repr, row))}")
+    lines += [
+        f"# {name}: {','.join(map(repr, row))}"
+        for name, values in rule.items()
+        for row in np.atleast_2d(values).tolist()
+    ]
     write_atomic(path, "\n".join(lines) + "\n")
     return list(LOST)
 

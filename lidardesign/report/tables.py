@@ -178,9 +178,13 @@ def table(
     )
     body = ""
     for (name, *cells), word, first in lines:
-        shown = [f'<th scope="row" class="name">{html.escape(name)}</th>']
-        for column, cell in enumerate(cells, start=1):
-            shown.append(f"<td{' class=name' if column < text_columns else ''}>{html.escape(cell)}</td>")
+        shown = [
+            f'<th scope="row" class="name">{html.escape(name)}</th>',
+            *(
+                f"<td{' class=name' if column < text_columns else ''}>{html.escape(cell)}</td>"
+                for column, cell in enumerate(cells, start=1)
+            ),
+        ]
         if word:
             shown[-1] = f'<td class="{word}">{words[word]}</td>'
         body += f"<tr{' class=first' if first else ''}>{''.join(shown)}</tr>"

@@ -355,9 +355,11 @@ class Studio:
             f"{_figure(scores.score(choices.design), metric.unit)} {metric.name}, {metric.better} is better, "
             f"on {len(scores.scenes)} training scenes kept for comparing"
         ]
-        for name, other in (("before the last change", self._reference), (beside and beside.name, beside)):
-            if other is not None and other is not choices.design:
-                lines.append(f"{_compared(scores.difference(choices.design, other), metric)} than {name}")
+        lines += [
+            f"{_compared(scores.difference(choices.design, other), metric)} than {name}"
+            for name, other in (("before the last change", self._reference), (beside and beside.name, beside))
+            if other is not None and other is not choices.design
+        ]
         self._page.ask("scored", partial(self._show_status, choices, lines))
 
     def _show_status(self, choices: Choices, lines: list[str]) -> None:
