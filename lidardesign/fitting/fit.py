@@ -426,8 +426,8 @@ class Fitter:
         looks = f" behind a first look of {adaptive.rule.looks} rays" if adaptive.rule.looks else ""
         text = (
             f"{len(adaptive.patterns)} patterns{looks} score {after:.4g} {metric.unit} on training scenes held back, "
+            f"the best single one {before:.4g}"
         )
-        text += f"the best single one {before:.4g}"
         if best is following:
             notes.append(text)
             return design

@@ -212,11 +212,11 @@ def _sketch(mounted: Sequence[MountedPart], title: str, across: int, up: int, de
         ]
     lines += _ordinates(places_mm[:, 0], lambda value: float(drawn(np.array([value, low[1]]))[0]), along=True)
     lines += _ordinates(places_mm[:, 1], lambda value: float(drawn(np.array([low[0], value]))[1]), along=False)
-    titles = f'<text x="{WIDTH / 2:.0f}" y="12" text-anchor="middle" class="title">{title}</text>'
-    titles += (
+    titles = (
+        f'<text x="{WIDTH / 2:.0f}" y="12" text-anchor="middle" class="title">{title}</text>'
         f'<text x="{WIDTH - 4:.0f}" y="{HEIGHT - 4:.0f}" text-anchor="end">{"xyz"[across]} [mm] to the right</text>'
+        f'<text x="4" y="24">{"xyz"[up]} [mm] upwards</text>'
     )
-    titles += f'<text x="4" y="24">{"xyz"[up]} [mm] upwards</text>'
     return f'<svg viewBox="0 0 {WIDTH:.0f} {HEIGHT:.0f}" role="img" aria-label="{title}">{titles}{"".join(lines)}</svg>'
 
 
