@@ -291,8 +291,7 @@ def _notes(request: EvaluationRequest, entries: Sequence[Entry], matched: Sequen
     own = sorted((entry for entry in entries if not entry.baseline), key=lambda entry: entry.rays)
     shared = [entry for entry in own if entry.rays not in request.alone]
     # of each design the most rays, which come last
-    fired = {f"{entry.name!r}": entry.positions for entry in own}
-    notes += silent_notes(request.test, fired)
+    notes += silent_notes(request.test, {f"{entry.name!r}": entry.positions for entry in own})
     found = {(row.matched_to, row.matched_rays, row.design) for row in matched}
     beyond = {
         (entry.name, name)
@@ -352,7 +351,7 @@ def slipped_notes(casts: SecondCasts) -> list[str]:
         return []
     return [
         BackgroundNote(
-            f"{casts.found:,} of {casts.rays:,} rays ({casts.found / casts.rays:.2%}) had slipped between triangles, as "
-            "happens at the vertices of a mesh; a second cast, slightly shifted, found what they meet"
+            f"{casts.found:,} of {casts.rays:,} rays ({casts.found / casts.rays:.2%}) had slipped between triangles, "
+            "as happens at the vertices of a mesh; a second cast, slightly shifted, found what they meet"
         )
     ]
