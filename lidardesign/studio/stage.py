@@ -252,5 +252,4 @@ def _box_edges(box: np.ndarray) -> np.ndarray:
     """The edges of a box (2, 3) as segments (12, 2, 3)."""
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
     ends = [(a, b) for a in corners for b in corners if (b - a).min() >= 0 and (b - a).sum() == 1]
-    places = np.where(np.array(ends, dtype=bool), box[1], box[0])
-    return np.asarray(places)
+    return np.where(np.array(ends, dtype=bool), box[1], box[0])

@@ -415,5 +415,9 @@ def convert(request: dict[str, Any], _: object) -> dict[str, Any]:
 
 def refused(name: str, kind: str, where: str) -> DataError:
     """The error for a variable that is no full array of real numbers."""
-    allowed, hint = "full numeric arrays", "save arrays, not structures"
-    return DataError(f"{name!r} is a MATLAB {kind}", where=where, allowed=allowed, hint=hint)
+    return DataError(
+        f"{name!r} is a MATLAB {kind}",
+        where=where,
+        allowed="full numeric arrays",
+        hint="save arrays, not structures",
+    )
