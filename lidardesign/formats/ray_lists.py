@@ -436,8 +436,10 @@ def write_sensor_csv(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
         "roll is lost: spreads are those along azimuth and elevation":
             any(sensor.roll_rad for sensor in design.sensors),
     }  # fmt: skip
-    notes = ["names, layout and provenance are lost; readers assume level 0.95"]
-    notes += [note for note, applies in lost.items() if applies]
+    notes = [
+        "names, layout and provenance are lost; readers assume level 0.95",
+        *(note for note, applies in lost.items() if applies),
+    ]
     z = interval_factor(DEFAULT_LEVEL)
     for sensor in design.sensors:
         azimuth_sigma, elevation_sigma = (angle / (2 * z) for angle in sensor.field_of_view_rad)

@@ -148,8 +148,8 @@ def _marginal(
     bounds: np.ndarray,
     bins: int,
 ) -> Marginal:
-    ends = [_central(values, weights, TAIL)]
-    ends += [_central(points[:, axis], share, 0.025) for points, share in beside.values()]
+    others = (_central(points[:, axis], share, 0.025) for points, share in beside.values())
+    ends = [_central(values, weights, TAIL), *others]
     low, high = _widened(min(end[0] for end in ends), max(end[1] for end in ends))
     # nothing lies beyond the space but a design that was made for another one
     low, high = max(low, bounds[0]), min(high, bounds[1])

@@ -126,8 +126,10 @@ class Stage:
 
     def show_sensors(self, sensors: Sequence[Sensor], chosen: str | None, beside: Colour | None = None) -> None:
         """Draw sensors with their fields of view and gates; the chosen one in another colour."""
-        pieces = [(_segments(frustum_lines(one)), one) for one in sensors]
-        pieces += [(_segments(origin_lines(one, DEFAULT_LEVEL)), one) for one in sensors]
+        pieces = [
+            *((_segments(frustum_lines(one)), one) for one in sensors),
+            *((_segments(origin_lines(one, DEFAULT_LEVEL)), one) for one in sensors),
+        ]
         shades = [np.tile(CHOSEN if one.name == chosen else beside or SENSOR, (len(lines), 1)) for lines, one in pieces]
         name = "/design" if beside is None else "/beside"
         self._lines(f"{name}/fields of view", np.concatenate([lines for lines, _ in pieces]), np.concatenate(shades))
