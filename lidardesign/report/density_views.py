@@ -51,7 +51,7 @@ class DensityView:
         planes: At most two, the one in which it is widest first.
         samples: Number of samples.
         effective: Their effective number.
-        scene, frame: The scene under the planes, and its frame.
+        scene: The scene under the planes.
     """
 
     marginals: tuple[Marginal, ...]
@@ -59,7 +59,6 @@ class DensityView:
     samples: int
     effective: float
     scene: str
-    frame: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,9 +119,8 @@ def density_view(samples: Samples, scene: Scene, designs: Sequence[DesignSpec] =
         scene: The scene under the projections, at its middle frame.
         designs: Designs with marginals to compare.
     """
-    moment = scene.frames // 2
-    planes, effective = plane_densities(samples, scene, moment), effective_count(samples.weights)
-    return DensityView(marginals(samples, designs), planes, len(samples), effective, scene.name, moment)
+    planes, effective = plane_densities(samples, scene, scene.frames // 2), effective_count(samples.weights)
+    return DensityView(marginals(samples, designs), planes, len(samples), effective, scene.name)
 
 
 def marginals(samples: Samples, designs: Sequence[DesignSpec] = ()) -> tuple[Marginal, ...]:
