@@ -57,7 +57,8 @@ class _Front:
     hits: Hits
 
     def subset(self, chosen: np.ndarray | slice) -> _Front:
-        return _Front(self.beams.subset(chosen), self.number[chosen], self.passed[chosen], self.hits.subset(chosen))
+        hits = self.hits.subset(chosen)
+        return _Front(self.beams.subset(chosen), self.number[chosen], self.passed[chosen], hits)
 
 
 def detours(scene: Scene, beams: Beams, hits: Hits, tracer: Tracer) -> Echoes:
