@@ -375,9 +375,9 @@ class AimedPoints:
         """
         chosen: list[tuple[np.ndarray, np.ndarray]] = []
         total = squares = 0.0
-        while len(chosen) < (128 if total > 0.0 else HOPELESS_BLOCKS) and total**2 < effective_samples * max(
-            squares, TINY
-        ):
+        while len(chosen) < 128 and total**2 < effective_samples * max(squares, TINY):
+            if len(chosen) == HOPELESS_BLOCKS and total == 0.0:
+                break
             if len(chosen) == len(self._blocks):
                 self._blocks.append(self._block(len(chosen)))
             chosen.append(self._blocks[len(chosen)])
