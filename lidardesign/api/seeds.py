@@ -21,6 +21,7 @@ from lidardesign.formats.designs import read_design
 from lidardesign.run.clock import Progress, outermost_clock, running
 from lidardesign.run_folder import Notes, RunFolder, log_note
 from lidardesign.scoring.evaluation.request import usual_numbers
+from lidardesign.scoring.evaluation.score import progress_of_part
 from lidardesign.scoring.evaluation.seeds import over_seeds
 
 if TYPE_CHECKING:
@@ -178,7 +179,7 @@ class SeedsRequest:
         """
         with nullcontext(outermost_clock()) if outermost_clock() else running() as clock:
             scores = [
-                request.score(_part(progress, number, len(self.requests)), searching)
+                request.score(progress_of_part(progress, number, len(self.requests)), searching)
                 for number, request in enumerate(self.requests)
             ]
             seeds = [request.seed for request in self.requests]
@@ -190,12 +191,6 @@ class SeedsRequest:
     def _scenes_seed(self) -> int:
         request = self.requests[0]
         return request.seed if request.options.scenes_seed is None else request.options.scenes_seed
-
-
-def _part(progress: Progress | None, number: int, parts: int) -> Progress | None:
-    if progress is None:
-        return None
-    return lambda name, done, total: progress(name, number * total + done, parts * total)
 
 
 def _check_runs(runs: Sequence[RunFolder]) -> None:

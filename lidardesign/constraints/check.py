@@ -196,12 +196,14 @@ def _boresight(name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any], s
 def _intervals(name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any]) -> list[ConstraintCheck]:
     """Checks of a sensor's gate and field of view."""
     view, (start, end) = sensor["field_of_view_rad"], (sensor["gate_m"][key] for key in ("start", "end"))
-    values = {f"field_of_view.{axis}_deg": math.degrees(view[axis]) for axis in ANGLES}
-    values |= {"gate.start_m": start, "gate.end_m": end, "gate.width_m": end - start}
-    checks = []
-    for key, found in values.items():
-        checks += _between(f"{name}.{key}", found, _get(rules, *key.split(".")))
-    return checks
+    values = {
+        **{f"field_of_view.{axis}_deg": math.degrees(view[axis]) for axis in ANGLES},
+        "gate.start_m": start,
+        "gate.end_m": end,
+        "gate.width_m": end - start,
+    }
+    each = (_between(f"{name}.{key}", found, _get(rules, *key.split("."))) for key, found in values.items())
+    return [check for checks in each for check in checks]
 
 
 def _inside_space(name: str, sensor: Mapping[str, Any], space: Mapping[str, Any]) -> list[ConstraintCheck]:
@@ -291,9 +293,7 @@ def _astray(pattern: Mapping[str, Any], sensors: Sequence[Mapping[str, Any]], le
         own, view, gate = np.flatnonzero(owner == index), sensor["field_of_view_rad"], sensor["gate_m"]
         columns = ("azimuth_rad", "elevation_rad", "gate_start_m", "gate_end_m")
         azimuth, elevation, start, end = (np.asarray(pattern[key], dtype=np.float64)[:, own] for key in columns)
-        aimed = sensor["boresight"]
-        frame = boresight_frame(aimed["azimuth_rad"], aimed["elevation_rad"], aimed.get("roll_rad") or 0.0)
-        forward, *across = np.moveaxis(direction(azimuth, elevation) @ frame.T, -1, 0)
+        forward, *across = np.moveaxis(direction(azimuth, elevation) @ _frame(sensor).T, -1, 0)
         sideways = np.hypot(*across)
         # true angles from the boresight, along the field's two axes
         angle = np.arctan2(sideways, forward) / np.where(sideways > 0, sideways, 1.0)
@@ -310,10 +310,18 @@ def _astray(pattern: Mapping[str, Any], sensors: Sequence[Mapping[str, Any]], le
         ends = [float(start.min(initial=gate["start"])), float(end.max(initial=gate["end"]))]
         slack = AGREEMENT * gate["end"]
         kept = ends[0] >= gate["start"] - slack and ends[1] <= gate["end"] + slack
-        checks.append(ConstraintCheck(f"{name}.rays.gate_m", [gate["start"], gate["end"]], ends, kept))
-        checks.append(_starts(name, pattern, own, sensor["origin_m"], level))
+        checks += [
+            ConstraintCheck(f"{name}.rays.gate_m", [gate["start"], gate["end"]], ends, kept),
+            _starts(name, pattern, own, sensor["origin_m"], level),
+        ]
         failed += [check for check in checks if not check.satisfied]
     return failed
+
+
+def _frame(sensor: Mapping[str, Any]) -> np.ndarray:
+    """The frame of a sensor's boresight, shape (3, 3)."""
+    aimed = sensor["boresight"]
+    return boresight_frame(aimed["azimuth_rad"], aimed["elevation_rad"], aimed.get("roll_rad") or 0.0)
 
 
 def _starts(
@@ -462,9 +470,7 @@ def _differences(part: Part, index: int, sensor: Mapping[str, Any], pattern: Map
     own = np.flatnonzero(np.asarray(pattern["sensor"]) == index)
     angles = ("azimuth_rad", "elevation_rad")
     azimuth, elevation = (np.asarray(pattern[key][0], dtype=np.float64)[own] for key in angles)
-    aimed = sensor["boresight"]
-    frame = boresight_frame(aimed["azimuth_rad"], aimed["elevation_rad"], aimed.get("roll_rad") or 0.0)
-    to_part = (boresight_frame(*part.centre_rad).T @ frame).T
+    to_part = (boresight_frame(*part.centre_rad).T @ _frame(sensor)).T
     away, ray = cKDTree(part.directions).query(direction(azimuth, elevation) @ to_part)
     starts = np.stack([np.asarray(pattern[f"origin_{axis}"][0], dtype=np.float64)[own] for axis in AXES], axis=1)
     moved = np.abs(starts - np.asarray(sensor["origin_m"]["mean"])).max(axis=1, initial=0.0) > COARSE_SLACK

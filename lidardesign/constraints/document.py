@@ -27,7 +27,7 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
 from lidardesign.errors import UNSET_HINT, ConfigError
 from lidardesign.run.validation import (
@@ -40,7 +40,7 @@ from lidardesign.run.validation import (
 from lidardesign.run.yaml import Document, KeyPath, leaves, load_yaml, merged
 from lidardesign.run_folder import Notes, log_note
 from lidardesign.sensors.bandwidth import Bandwidth
-from lidardesign.sensors.design_file import Distance, Vector
+from lidardesign.sensors.design_file import Distance, StrictKeys, Vector
 from lidardesign.sensors.sensor import MOST_RAYS
 from lidardesign.space import FARTHEST_M, MOST_TURNS, SHORTEST_M
 from lidardesign.task import Task
@@ -56,13 +56,7 @@ MOST_FITTED = 1000
 Count = Annotated[int, Field(ge=1, le=MOST_FITTED)]
 
 
-class _Keys(BaseModel):
-    """Unknown keys are errors; numbers are numbers, not text."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
-
-
-class SensorCount(_Keys):
+class SensorCount(StrictKeys):
     """`{count: 4}` or `{min: 1, max: 8}`."""
 
     count: Count | None = None
@@ -76,41 +70,41 @@ class SensorCount(_Keys):
         return self
 
 
-class DistanceRange(_Keys):
+class DistanceRange(StrictKeys):
     """Bounds on a distance [m]."""
 
     min: Distance | None = None
     max: Positive | None = None
 
 
-class AngleRange(_Keys):
+class AngleRange(StrictKeys):
     """Bounds on an azimuth [degrees], any number of turns."""
 
     min: Angle | None = None
     max: Angle | None = None
 
 
-class ElevationRange(_Keys):
+class ElevationRange(StrictKeys):
     """Bounds on an elevation [degrees]."""
 
     min: Annotated[float, Field(ge=-90, le=90)] | None = None
     max: Annotated[float, Field(ge=-90, le=90)] | None = None
 
 
-class FieldRange(_Keys):
+class FieldRange(StrictKeys):
     """Bounds on a full angle of view [degrees]."""
 
     min: Annotated[float, Field(ge=0, le=360)] | None = None
     max: Annotated[float, Field(ge=SHORTEST_M, le=360)] | None = None
 
 
-class SpreadLimit(_Keys):
+class SpreadLimit(StrictKeys):
     """The largest standard deviation of the origin, along any or along its thinnest direction [m]."""
 
     max: Positive | None = None
 
 
-class ExcludedBox(_Keys):
+class ExcludedBox(StrictKeys):
     """A box in whose interior no sensor may be [m]; one without volume excludes nothing."""
 
     low_m: Vector
@@ -124,7 +118,7 @@ class ExcludedBox(_Keys):
         return self
 
 
-class Origin(_Keys):
+class Origin(StrictKeys):
     """Bounds on the origin of a sensor [m]."""
 
     low_m: Vector | None = None
@@ -142,7 +136,7 @@ class Origin(_Keys):
         return self
 
 
-class RollRange(_Keys):
+class RollRange(StrictKeys):
     """Bounds on a roll about the boresight [degrees].
 
     Beyond 45 degrees for parts alone: a fitted field is the same with its two angles exchanged.
@@ -152,7 +146,7 @@ class RollRange(_Keys):
     max: Annotated[float, Field(ge=-180, le=180)] | None = None
 
 
-class Boresight(_Keys):
+class Boresight(StrictKeys):
     """Bounds on the boresight of a sensor and its roll [degrees]."""
 
     azimuth_deg: AngleRange = AngleRange()
@@ -160,14 +154,14 @@ class Boresight(_Keys):
     roll_deg: RollRange = RollRange()
 
 
-class FieldOfView(_Keys):
+class FieldOfView(StrictKeys):
     """Bounds on the full angles of a field of view, horizontal and vertical in the sensor's frame [degrees]."""
 
     horizontal_deg: FieldRange = FieldRange()
     vertical_deg: FieldRange = FieldRange()
 
 
-class Gate(_Keys):
+class Gate(StrictKeys):
     """Bounds on the start, end and width of a gate, as one-way distances [m]."""
 
     start_m: DistanceRange = DistanceRange()
@@ -175,7 +169,7 @@ class Gate(_Keys):
     width_m: DistanceRange = DistanceRange()
 
 
-class Budget(_Keys):
+class Budget(StrictKeys):
     """Rays per frame and the read-out of the whole design."""
 
     rays: Annotated[int, Field(ge=1, le=MOST_RAYS)] | None = None
@@ -191,19 +185,19 @@ class Budget(_Keys):
         return Bandwidth(self.bin_ps, self.bits_per_bin, self.rate_hz)
 
 
-class MostOfPart(_Keys):
+class MostOfPart(StrictKeys):
     """The largest number of a part in a design, as `{max: 1}`."""
 
     max: Count
 
 
-class PartPrice(_Keys):
+class PartPrice(StrictKeys):
     """The largest price of all parts together, as `{max: 40}`."""
 
     max: Positive
 
 
-class Parts(_Keys):
+class Parts(StrictKeys):
     """Real parts that the design is made of, chosen with their poses.
 
     Arguments:
@@ -216,7 +210,7 @@ class Parts(_Keys):
 
     names: Annotated[list[Annotated[str, Field(min_length=1)]], Field(min_length=1)] | Literal["catalog"] = "catalog"
     count: Count | None = None
-    each: dict[str, MostOfPart] = {}
+    each: dict[str, MostOfPart] = Field({})
     power_w: Positive | None = None
     price: PartPrice | None = None
 
@@ -228,7 +222,7 @@ class Parts(_Keys):
         return {key: (name, bound) for key, (name, bound) in bounds.items() if bound is not None}
 
 
-class SensorConstraints(_Keys):
+class SensorConstraints(StrictKeys):
     """The keys that may also stand under `each`."""
 
     origin: Origin = Origin()
@@ -283,7 +277,7 @@ class Constraints(SensorConstraints):
     budget: Budget = Budget()
     parts: Parts | None = None
     survive: int = Field(0, ge=0, le=1)
-    each: list[SensorConstraints] = []
+    each: list[SensorConstraints] = Field([])
 
     @classmethod
     def from_mapping(

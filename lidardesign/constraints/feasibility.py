@@ -88,8 +88,10 @@ def check_feasible(
         for number, mount in enumerate(rules.origin.mounts_m or []):
             for axis, value in enumerate(mount):
                 lows, highs = _origin_limits(rules, axis, space)
-                beyond = [low for low in lows if value < low.value - AGREEMENT]
-                beyond += [high for high in highs if value > high.value + AGREEMENT]
+                beyond = [
+                    *(low for low in lows if value < low.value - AGREEMENT),
+                    *(high for high in highs if value > high.value + AGREEMENT),
+                ]
                 if beyond:
                     text = f"{DIMENSIONS[axis]} of a mount is {value:g}, beyond {beyond[0].value:g}"
                     _refuse(text, [f"{name}[{number}]", beyond[0].name])

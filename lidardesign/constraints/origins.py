@@ -187,9 +187,11 @@ def placement_notes(rules: Sequence[SensorRules]) -> tuple[str, ...]:
         if lost:
             share = f"{len(lost)} of {len(listed)} {one.path('origin.mounts_m')}"
             notes.append(f"{share} left out, inside {name}: {', '.join(lost)}")
-        for number, box in enumerate(one.origin.exclude or []):
-            if not all(low < high for low, high in zip(box.low_m, box.high_m, strict=True)):
-                notes.append(f"{name}[{number}] has no volume and excludes nothing")
+        notes += [
+            f"{name}[{number}] has no volume and excludes nothing"
+            for number, box in enumerate(one.origin.exclude or [])
+            if not all(low < high for low, high in zip(box.low_m, box.high_m, strict=True))
+        ]
     return tuple(dict.fromkeys(notes))
 
 

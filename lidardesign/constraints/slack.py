@@ -115,8 +115,7 @@ def _said(value: Any) -> Any:
 def split_name(name: str, sensors: Sequence[str]) -> tuple[str, str]:
     """The sensor that a check is of, empty where it is of the whole design, and the key of its bound."""
     # one sensor's name may begin with another's
-    owners = [sensor for sensor in sensors if name.startswith(f"{sensor}.")]
-    owner = max(owners, key=len, default="")
+    owner = max((sensor for sensor in sensors if name.startswith(f"{sensor}.")), key=len, default="")
     return owner, name.removeprefix(f"{owner}.") if owner else name
 
 

@@ -130,8 +130,10 @@ def _wider_run(request: FitRequest, conflicts: Sequence[str]) -> str | None:
     origins = [rules.origin for rules in request.constraints.rules]
     ends = np.stack([run.config.space.low[:3], run.config.space.high[:3]])
     boxes = [(one.low_m or ends[0], one.high_m or ends[1]) for one in origins if one.low_m or one.high_m]
-    places = [place for one in origins for place in (one.fixed_m, *(one.mounts_m or ())) if place is not None]
-    places += [place for low, high in boxes for place in (low, np.maximum(low, high))]
+    places = [
+        *(place for one in origins for place in (one.fixed_m, *(one.mounts_m or ())) if place is not None),
+        *(place for low, high in boxes for place in (low, np.maximum(low, high))),
+    ]
     if not places:
         return None
     command = [str(word) for word in read_manifest(run.folder).get("command") or ()]
@@ -426,8 +428,8 @@ class Fitter:
         looks = f" behind a first look of {adaptive.rule.looks} rays" if adaptive.rule.looks else ""
         text = (
             f"{len(adaptive.patterns)} patterns{looks} score {after:.4g} {metric.unit} on training scenes held back, "
+            f"the best single one {before:.4g}"
         )
-        text += f"the best single one {before:.4g}"
         if best is following:
             notes.append(text)
             return design

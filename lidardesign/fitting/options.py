@@ -80,17 +80,19 @@ class FitOptions:
         if self.name is not None and not NAME_PATTERN.fullmatch(self.name):
             allowed = "letters, digits, _, -, + and . (not in front), at most 100"
             raise ConfigError(f"{self.name!r} is not a name for a design", where="--name", allowed=allowed)
-        if self.layout is not None:
-            check_choice(self.layout, "--layout", FITTED_LAYOUTS)
-        if self.gates is not None:
-            check_choice(self.gates, "--gates", get_args(Gates))
-        if self.least is not None:
-            check_choice(self.least, "--least", LEAST)
+        for name, known in {"layout": FITTED_LAYOUTS, "gates": get_args(Gates), "least": LEAST}.items():
+            if getattr(self, name) is not None:
+                check_choice(getattr(self, name), f"--{name}", known)
         if self.sensors not in (None, BEST, *range(1, MOST_FITTED + 1)) and not self.numbers:
             allowed = f"a whole number from 1 to {MOST_FITTED}, best, or with parts numbers such as 1-4"
             raise ConfigError(repr(self.sensors), where="--sensors", allowed=allowed)
-        limits = {"rays": (1, MOST_RAYS), "channels": (1, MOST_FITTED), "seed": (0, MAX_SEED)}
-        limits |= {"survive": (0, 1), "adaptive": (1, MOST_PATTERNS)}
+        limits = {
+            "rays": (1, MOST_RAYS),
+            "channels": (1, MOST_FITTED),
+            "seed": (0, MAX_SEED),
+            "survive": (0, 1),
+            "adaptive": (1, MOST_PATTERNS),
+        }
         for name, (low, high) in limits.items():
             if getattr(self, name) is not None:
                 check_number(getattr(self, name), f"--{name}", low, high, whole=True)

@@ -134,8 +134,10 @@ def further_sets(coverage: Coverage, limits: SetLimits, chosen: Sequence[int], m
         if out != into
     ]
     of_kinds = [order[kind[order] == one] for one in present]
-    firsts = [int(rows[len(rows) // part]) for rows in of_kinds for part in (len(rows) + 1, *STARTS)]
-    firsts += [int(order[first]) for own, _ in others for first in np.unique(own[order], return_index=True)[1]]
+    firsts = [
+        *(int(rows[len(rows) // part]) for rows in of_kinds for part in (len(rows) + 1, *STARTS)),
+        *(int(order[first]) for own, _ in others for first in np.unique(own[order], return_index=True)[1]),
+    ]
     started = [_filled(coverage, limits, (first,)) for first in firsts]
     found = {tuple(sorted(chosen)): tuple(chosen)}
     for group, room in ((alone, (most + 1) // 2), (exchanged + started, most)):

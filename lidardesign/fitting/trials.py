@@ -312,8 +312,10 @@ class GoalSearch:
     def notes(self, found: GoalTrial) -> list[str]:
         """Lines on what was found, the next cheaper one, and all that was tried."""
         metric = self.metric
-        text = f"goal {self.request.goal:g} {metric.unit}, least {self.request.least}: {found.text(metric)} on "
-        text += f"{len(found.trial.scores)} training scenes held back"
+        text = (
+            f"goal {self.request.goal:g} {metric.unit}, least {self.request.least}: {found.text(metric)} on "
+            f"{len(found.trial.scores)} training scenes held back"
+        )
         cheaper = [one for one in self.tried if one.cost < found.cost]
         if cheaper:
             text += f"; the next cheaper one tried: {max(cheaper, key=lambda one: one.cost).text(metric)}"

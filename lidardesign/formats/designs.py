@@ -74,7 +74,6 @@ def load_design(path: Path, reach_m: float | None = None) -> DesignSpec:
         DataError: The file cannot be read, or is a CSV, NPZ or XML file with invalid content (exit 3).
         ConfigError: The file is not YAML, or not a design (exit 2).
     """
-    path = Path(path)
     head = read_head(path, RAY_TABLE, hint="give a design file, such as RUN/designs/NAME.yaml")
     rig = read_rig(path, head)
     if rig is not None:

@@ -87,8 +87,7 @@ def short_tour(points: np.ndarray) -> np.ndarray:
     own[~own.any(axis=1), -1] = True
     near = found[~own].reshape(len(points), -1)
     starts = [np.arange(count), *([_nearest(points)] if count <= MOST_NEAREST else [])]
-    tours = [_improved(points, near, start) for start in starts]
-    best = min(tours, key=lambda tour: travel(points[tour]))
+    best = min((_improved(points, near, start) for start in starts), key=lambda tour: travel(points[tour]))
     longest = int(_lengths(points[best], points[np.roll(best, -1)]).argmax())
     return np.roll(best, -(longest + 1))
 

@@ -206,15 +206,17 @@ def _sketch(mounted: Sequence[MountedPart], title: str, across: int, up: int, de
             mark = UPRIGHT * top[[across, up]]
             lines.append(f'<line class="up" x1="{x:.1f}" y1="{y:.1f}" x2="{x + mark[0]:.1f}" y2="{y - mark[1]:.1f}"/>')
         names = html.escape(", ".join(one.name for one in here))
-        lines.append(f'<rect x="{x - 3:.1f}" y="{y - 3:.1f}" width="6" height="6"/>')
-        lines.append(f'<text class="name" x="{x + 6:.1f}" y="{y - 6:.1f}">{names}</text>')
+        lines += [
+            f'<rect x="{x - 3:.1f}" y="{y - 3:.1f}" width="6" height="6"/>',
+            f'<text class="name" x="{x + 6:.1f}" y="{y - 6:.1f}">{names}</text>',
+        ]
     lines += _ordinates(places_mm[:, 0], lambda value: float(drawn(np.array([value, low[1]]))[0]), along=True)
     lines += _ordinates(places_mm[:, 1], lambda value: float(drawn(np.array([low[0], value]))[1]), along=False)
-    titles = f'<text x="{WIDTH / 2:.0f}" y="12" text-anchor="middle" class="title">{title}</text>'
-    titles += (
+    titles = (
+        f'<text x="{WIDTH / 2:.0f}" y="12" text-anchor="middle" class="title">{title}</text>'
         f'<text x="{WIDTH - 4:.0f}" y="{HEIGHT - 4:.0f}" text-anchor="end">{"xyz"[across]} [mm] to the right</text>'
+        f'<text x="4" y="24">{"xyz"[up]} [mm] upwards</text>'
     )
-    titles += f'<text x="4" y="24">{"xyz"[up]} [mm] upwards</text>'
     return f'<svg viewBox="0 0 {WIDTH:.0f} {HEIGHT:.0f}" role="img" aria-label="{title}">{titles}{"".join(lines)}</svg>'
 
 
@@ -250,8 +252,10 @@ def _ordinates(values_mm: np.ndarray, place_of: Callable[[float], float], *, alo
             turn = f'transform="rotate(-90 {label + 3:.1f} {bottom + 4:.1f})"'
             lines.append(f'<text x="{label + 3:.1f}" y="{bottom + 4:.1f}" text-anchor="end" {turn}>{text}</text>')
         else:
-            lines.append(f'<path class="leader" d="M{WIDTH - 10:.0f} {at:.1f}H{EDGE + 8:.1f}L{EDGE:.1f} {label:.1f}"/>')
-            lines.append(f'<text x="{EDGE - 3:.1f}" y="{label + 3:.1f}" text-anchor="end">{text}</text>')
+            lines += [
+                f'<path class="leader" d="M{WIDTH - 10:.0f} {at:.1f}H{EDGE + 8:.1f}L{EDGE:.1f} {label:.1f}"/>',
+                f'<text x="{EDGE - 3:.1f}" y="{label + 3:.1f}" text-anchor="end">{text}</text>',
+            ]
     return lines
 
 

@@ -81,7 +81,6 @@ def write_folder(path: Path, files: Mapping[str, bytes]) -> list[str]:
     Raises:
         DataError: A file has that name, or the folder cannot be written.
     """
-    path = Path(path)
     if path.exists() and not path.is_dir():
         raise DataError(
             "is a file, and this format is a folder of files", where=str(path), hint="give the name of a folder"

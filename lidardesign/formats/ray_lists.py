@@ -266,9 +266,11 @@ def write_csv(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     columns, rule = pattern_columns(design, rays)
     rows = zip(*(column.tolist() for column in columns.values()), strict=True)
     lines = [",".join(columns), *(",".join(map(repr, row)) for row in rows)]
-    for name, values in rule.items():
-        for row in np.atleast_2d(values).tolist():
-            lines.append(f"# {name}: {','.join(map(repr, row))}")
+    lines += [
+        f"# {name}: {','.join(map(repr, row))}"
+        for name, values in rule.items()
+        for row in np.atleast_2d(values).tolist()
+    ]
     write_atomic(path, "\n".join(lines) + "\n")
     return list(LOST)
 
@@ -323,7 +325,6 @@ def read_sensor_csv(path: Path) -> DesignSpec:
     Raises:
         DataError: The file cannot be read, or a cell cannot be used; with file, line and column (exit 3).
     """
-    path = Path(path)
     rows, notes = _rows(path)
     sensors = [_sensor(row, index, where) for index, (row, where) in enumerate(rows)]
     total = math.fsum(sensor.weight for sensor in sensors)
@@ -435,8 +436,10 @@ def write_sensor_csv(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
         "roll is lost: spreads are those along azimuth and elevation":
             any(sensor.roll_rad for sensor in design.sensors),
     }  # fmt: skip
-    notes = ["names, layout and provenance are lost; readers assume level 0.95"]
-    notes += [note for note, applies in lost.items() if applies]
+    notes = [
+        "names, layout and provenance are lost; readers assume level 0.95",
+        *(note for note, applies in lost.items() if applies),
+    ]
     z = interval_factor(DEFAULT_LEVEL)
     for sensor in design.sensors:
         azimuth_sigma, elevation_sigma = (angle / (2 * z) for angle in sensor.field_of_view_rad)
@@ -461,5 +464,5 @@ def write_sensor_csv(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
             azimuth_sigma, elevation_sigma, (end - start) / (2 * z), sensor.weight,
         ]  # fmt: skip
         table.append([repr(float(value)) for value in row])
-    write_atomic(Path(path), csv_table(table))
+    write_atomic(path, csv_table(table))
     return [*notes, f"the {len(rays)} rays are lost"] if len(rays) else notes

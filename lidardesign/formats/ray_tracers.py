@@ -160,8 +160,8 @@ def write_mitsuba(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     require_rays(design, rays, "a film")
     mounted = mounts(design, rays)
     found = places(mounted, rays)
-    notes = write_folder(path, {f"{one.name}{SCENE_SUFFIX}": document(_scene(one, rays)) for one in found})
-    notes += [
+    notes = [
+        *write_folder(path, {f"{one.name}{SCENE_SUFFIX}": document(_scene(one, rays)) for one in found}),
         "scenes hold no shapes: include one of them in yours, or yours in it; each sensor is a scene of its own",
         f"the light is one flash for all rays: only light straight there and back (max_depth {DEPTH}) is the ray's own",
         f"gates end on whole bins of {MM_PER_M * Bandwidth().bin_m:.1f} mm; times within the frame are lost",
@@ -234,7 +234,6 @@ def write_rgl(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> lis
         DataError: The design has no rays, or the folder cannot be written.
     """
     require_rays(design, rays, "a ray pattern")
-    path = Path(path)
     mounted = mounts(design, rays)
     root = element("sdf", {"version": "1.9"})
     model = child(root, "model", name=identifier(design.name))

@@ -191,7 +191,6 @@ def fit_mixture(
     generator: np.random.Generator,
     *,
     restarts: int = 12,
-    start: Mixture | None = None,
 ) -> EMResult:
     """The best of several short runs, continued until it converges.
 
@@ -200,11 +199,9 @@ def fit_mixture(
         bounds: One row per component.
         generator: Source of the seeds.
         restarts: Number of seeds that are tried.
-        start: Admissible parameters to continue from instead of seeds.
     """
-    if start is None:
-        start = _best_seed(features, bounds, generator, 1 if len(bounds) == 1 else max(restarts, 1))
-    result = _revive_dead(run_em(start, features, bounds), features, bounds, generator)
+    seed = _best_seed(features, bounds, generator, 1 if len(bounds) == 1 else max(restarts, 1))
+    result = revive_dead(run_em(seed, features, bounds), features, bounds, generator)
     different = len(np.unique(features.points, axis=0))
     if different >= len(bounds):
         return result
@@ -226,7 +223,7 @@ def _best_seed(features: Features, bounds: Bounds, generator: np.random.Generato
     return max(runs, key=lambda run: run.log_likelihood).mixture
 
 
-def _revive_dead(result: EMResult, features: Features, bounds: Bounds, generator: np.random.Generator) -> EMResult:
+def revive_dead(result: EMResult, features: Features, bounds: Bounds, generator: np.random.Generator) -> EMResult:
     """Restart components with too few samples on half of the heaviest one's, as long as their number falls."""
     notes: list[str] = []
     dead = _dead(result.mixture, features)

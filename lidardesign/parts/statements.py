@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
-from lidardesign.run.validation import is_name
+from lidardesign.sensors.design_file import StrictKeys, check_name
 from lidardesign.sensors.sensor import MOST_RAYS
 
 # In whatever unit a figure has: what is beyond is a slip.
@@ -20,27 +20,13 @@ Positive = Annotated[float, Field(gt=0, le=LARGEST)]
 NotNegative = Annotated[float, Field(ge=0, le=LARGEST)]
 Percent = Annotated[float, Field(gt=0, le=100)]
 Count = Annotated[int, Field(ge=1, le=MOST_RAYS)]
-
-
-def _check_text(text: str) -> str:
-    if not is_name(text):
-        raise ValueError("is blank, or has control characters")
-    return text
-
-
-Text = Annotated[str, Field(max_length=500), AfterValidator(_check_text)]
+Text = Annotated[str, Field(max_length=500), AfterValidator(check_name)]
 Angle = Annotated[float, Field(ge=-180, le=180)]
 Elevation = Annotated[float, Field(ge=-90, le=90)]
 Pair = Annotated[list[Annotated[float, Field(ge=-LARGEST, le=LARGEST)]], Field(min_length=2, max_length=2)]
 
 
-class _Keys(BaseModel):
-    """Unknown keys are errors; numbers are numbers, not text."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
-
-
-class Source(_Keys):
+class Source(StrictKeys):
     """A source of figures."""
 
     title: Text
@@ -49,7 +35,7 @@ class Source(_Keys):
     revision: Text | None = None
 
 
-class Statement(_Keys):
+class Statement(StrictKeys):
     """One source's figure and the conditions that it holds under.
 
     Arguments:
@@ -183,7 +169,7 @@ Limits = Annotated[list[Limit], Field(min_length=1)]
 Wholes = Annotated[list[Whole], Field(min_length=1)]
 
 
-class Figures(_Keys):
+class Figures(StrictKeys):
     """Fields of a part, or of one of its modes; each is a list of statements.
 
     Arguments:
@@ -297,7 +283,7 @@ class PartFile(Figures):
     kind: Literal["single zone", "multi-zone", "flash", "spinning", "scanner", "line scanner", "rosette"]
     summary: Text
     sources: dict[Text, Source]
-    modes: dict[Annotated[str, Field(pattern=MODE_NAME)], Figures] = {}
+    modes: dict[Annotated[str, Field(pattern=MODE_NAME)], Figures] = Field({})
 
     def figures(self, mode: str | None) -> dict[str, list[Any]]:
         """The statements of every field that one mode has."""

@@ -300,8 +300,10 @@ class PatternSearch:
         passes: int = 0,
     ) -> ChosenPatterns:
         """The patterns of a rule, each chosen on its frames, judged on frames that were held back."""
-        gates = [self._choose(self._whole, look, passes=passes) if (look >= 0).any() else self.fixed.gate]
-        gates += [self._choose(table, look, passes=passes) for table in tables]
+        gates = [
+            self._choose(self._whole, look, passes=passes) if (look >= 0).any() else self.fixed.gate,
+            *(self._choose(table, look, passes=passes) for table in tables),
+        ]
         held_back = self.held_back
         features = held_back.features
         picked = rule.patterns_of(rule.ranges(self._seen_m(held_back, look)) if features is None else features)

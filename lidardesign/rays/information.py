@@ -99,6 +99,12 @@ def require_valid(information: Information, rays: int, frames: int, where: str =
     sums = np.zeros(1) if information.sums is None else np.asarray(information.sums)
     most, rises = float(np.max(sums, initial=0.0)), np.diff(sums)
     seen_in = np.zeros(0, dtype=int) if information.seen_in is None else information.seen_in
+    indices = {
+        "ray": (information.ray, rays),
+        "item": (information.item, items),
+        "frame": (information.frame, frames),
+        "seen_in": (seen_in, frames),
+    }
     faults = {
         "ray, item and worth of different lengths": not len(information.item) == len(information.worth) == pairs,
         "seen_in and item of different lengths": information.seen_in is not None and len(seen_in) != pairs,
@@ -110,16 +116,15 @@ def require_valid(information: Information, rays: int, frames: int, where: str =
         f"sums {np.array2string(sums)} that are not 0 at 0, or fall, or rise faster than before": (
             (sums[:1] != 0).any() or (rises < 0).any() or (np.diff(rises) > SLACK * rises[:1]).any()
         ),
+        **{
+            f"{name} outside 0 to {count - 1}": bool(((index < 0) | (index >= count)).any())
+            for name, (index, count) in indices.items()
+        },
+        **{
+            f"{name} that is negative or not a number": not (np.isfinite(values) & (values >= 0)).all()
+            for name, values in (("worth", information.worth), ("weight", weight), ("harm", harm))
+        },
     }
-    for name, index, count in (
-        ("ray", information.ray, rays),
-        ("item", information.item, items),
-        ("frame", information.frame, frames),
-        ("seen_in", seen_in, frames),
-    ):
-        faults[f"{name} outside 0 to {count - 1}"] = bool(((index < 0) | (index >= count)).any())
-    for name, values in (("worth", information.worth), ("weight", weight), ("harm", harm)):
-        faults[f"{name} that is negative or not a number"] = not (np.isfinite(values) & (values >= 0)).all()
     for fault, found in faults.items():
         if found:
             raise PluginError(f"informs gave {fault}", where=where, allowed="see lidardesign.task.Information")

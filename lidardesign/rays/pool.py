@@ -147,8 +147,16 @@ def _packed(informed: Sequence[InformedScene], held_back: Sequence[InformedScene
     """The arrays of all scenes one after the other, and where each begins."""
     scenes = [*informed, *held_back]
     small = np.uint16 if rays <= np.iinfo(np.uint16).max else np.int32
-    kinds = {"ray": small, "item": np.uint16, "worth": np.float32, "range_m": np.float32, "weight": np.float64}
-    kinds |= {"spoiling": small, "harm": np.float32, "harm_range_m": np.float32}
+    kinds = {
+        "ray": small,
+        "item": np.uint16,
+        "worth": np.float32,
+        "range_m": np.float32,
+        "weight": np.float64,
+        "spoiling": small,
+        "harm": np.float32,
+        "harm_range_m": np.float32,
+    }
     arrays = {
         name: np.concatenate([np.asarray(getattr(scene, name)) for scene in scenes]).astype(kind)
         for name, kind in kinds.items()

@@ -51,7 +51,7 @@ class DensityView:
         planes: At most two, the one in which it is widest first.
         samples: Number of samples.
         effective: Their effective number.
-        scene, frame: The scene under the planes, and its frame.
+        scene: The scene under the planes.
     """
 
     marginals: tuple[Marginal, ...]
@@ -59,7 +59,6 @@ class DensityView:
     samples: int
     effective: float
     scene: str
-    frame: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,9 +119,8 @@ def density_view(samples: Samples, scene: Scene, designs: Sequence[DesignSpec] =
         scene: The scene under the projections, at its middle frame.
         designs: Designs with marginals to compare.
     """
-    moment = scene.frames // 2
-    planes, effective = plane_densities(samples, scene, moment), effective_count(samples.weights)
-    return DensityView(marginals(samples, designs), planes, len(samples), effective, scene.name, moment)
+    planes, effective = plane_densities(samples, scene, scene.frames // 2), effective_count(samples.weights)
+    return DensityView(marginals(samples, designs), planes, len(samples), effective, scene.name)
 
 
 def marginals(samples: Samples, designs: Sequence[DesignSpec] = ()) -> tuple[Marginal, ...]:
@@ -148,8 +146,8 @@ def _marginal(
     bounds: np.ndarray,
     bins: int,
 ) -> Marginal:
-    ends = [_central(values, weights, TAIL)]
-    ends += [_central(points[:, axis], share, 0.025) for points, share in beside.values()]
+    others = (_central(points[:, axis], share, 0.025) for points, share in beside.values())
+    ends = [_central(values, weights, TAIL), *others]
     low, high = _widened(min(end[0] for end in ends), max(end[1] for end in ends))
     # nothing lies beyond the space but a design that was made for another one
     low, high = max(low, bounds[0]), min(high, bounds[1])

@@ -9,7 +9,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -28,11 +27,9 @@ from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import design_document
 from lidardesign.sensors.pattern import field_on_sphere
 from lidardesign.sensors.sensor import Sensor, interval_factor, tangent_directions
+from lidardesign.simulate.plan import Planner
 from lidardesign.simulate.returns import build_casters, simulate_many
 from lidardesign.space import DesignSpace
-
-if TYPE_CHECKING:
-    from lidardesign.simulate.plan import Planner
 
 MOST_STEPS = 25  # positions, and frames, that a slider goes through
 MOST_RAYS = 2000  # drawn per design

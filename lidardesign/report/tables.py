@@ -81,8 +81,16 @@ def mounting_table(evaluation: Evaluation) -> str:
     mounting, unit = evaluation.mounting, evaluation.metric.unit
     if mounting is None:
         return ""
-    headings = ["design", "rays", f"exact [{unit}]", f"careless [{unit}]", "failures", f"difference [{unit}]"]
-    headings += ["95 % interval", "careless is"]
+    headings = [
+        "design",
+        "rays",
+        f"exact [{unit}]",
+        f"careless [{unit}]",
+        "failures",
+        f"difference [{unit}]",
+        "95 % interval",
+        "careless is",
+    ]
     lines = []
     for index, (row, own, cost) in enumerate(zip(mounting.rows, evaluation.rows, mounting.costs, strict=True)):
         values = map(four_digits, (own.value, row.value))
@@ -124,15 +132,31 @@ def bandwidth_table(evaluation: Evaluation) -> str:
     if not evaluation.equal_bandwidth:
         return ""
     unit = evaluation.metric.unit
-    headings = ["design", "baseline", "rays", "its rays", "Mbit/s", f"design [{unit}]", f"its [{unit}]"]
-    headings += ["difference (95 % interval)", "design is"]
+    headings = [
+        "design",
+        "baseline",
+        "rays",
+        "its rays",
+        "Mbit/s",
+        f"design [{unit}]",
+        f"its [{unit}]",
+        "difference (95 % interval)",
+        "design is",
+    ]
     own = {(row.design, row.rays): row for row in evaluation.rows if not row.baseline}
     pairs = zip(evaluation.equal_bandwidth, evaluation.paired_bandwidth, strict=True)
     lines = []
     for index, (row, pair) in enumerate(pairs):
         mine = own[pair.a, pair.rays]
-        cells = [pair.a, pair.b, str(pair.rays), str(row.rays), *map(four_digits, (mine.bandwidth_mbps, mine.value))]
-        cells += [four_digits(row.value), f"{four_digits(pair.difference)} ({interval(pair)})", ""]
+        cells = [
+            pair.a,
+            pair.b,
+            str(pair.rays),
+            str(row.rays),
+            *map(four_digits, (mine.bandwidth_mbps, mine.value, row.value)),
+            f"{four_digits(pair.difference)} ({interval(pair)})",
+            "",
+        ]
         begins = bool(index and row.design == evaluation.equal_bandwidth[0].design)
         lines.append((cells, verdict(evaluation, pair), begins))
     caption = "Each design against baselines with as many rays (their rays) as fit in its bandwidth."
@@ -178,9 +202,13 @@ def table(
     )
     body = ""
     for (name, *cells), word, first in lines:
-        shown = [f'<th scope="row" class="name">{html.escape(name)}</th>']
-        for column, cell in enumerate(cells, start=1):
-            shown.append(f"<td{' class=name' if column < text_columns else ''}>{html.escape(cell)}</td>")
+        shown = [
+            f'<th scope="row" class="name">{html.escape(name)}</th>',
+            *(
+                f"<td{' class=name' if column < text_columns else ''}>{html.escape(cell)}</td>"
+                for column, cell in enumerate(cells, start=1)
+            ),
+        ]
         if word:
             shown[-1] = f'<td class="{word}">{words[word]}</td>'
         body += f"<tr{' class=first' if first else ''}>{''.join(shown)}</tr>"
@@ -369,9 +397,17 @@ def audit_section(evaluation: Evaluation, audit: Audit) -> str:
         f"{audit.tolerance:g} {html.escape(audit.unit)}, the metric's tolerance; the largest difference is "
         f"{audit.worst:.2g}.</p>"
     )
-    unit = audit.unit
-    headings = ["design", "rays", f"planned [{unit}]", f"all [{unit}]", "difference", "95 % interval"]
-    headings += ["planned [s]", "all [s]", "moved"]
+    headings = [
+        "design",
+        "rays",
+        f"planned [{audit.unit}]",
+        f"all [{audit.unit}]",
+        "difference",
+        "95 % interval",
+        "planned [s]",
+        "all [s]",
+        "moved",
+    ]
     lines = [
         (_audit_cells(row), "worse" if row in audit.failed else "better", bool(index and _starts(audit.rows, index)))
         for index, row in enumerate(audit.rows)

@@ -268,9 +268,11 @@ def view_notes(shown: SceneFigure) -> list[str]:
         steps = "patterns" if PATTERN in shown.places[0] else "positions"
         left_out.append(f"{len(shown.places)} of {shown.all_places} {steps} are shown")
     left_out += [f"{name} fires {_runs(patterns, shown.scene)}" for name, patterns in shown.fired.items()]
-    for one in shown.designs:
-        if len(one.rays[0]) < one.fired:
-            left_out.append(f"{len(one.rays[0])} of {one.fired} rays of {one.design.name} are drawn")
+    left_out += [
+        f"{len(one.rays[0])} of {one.fired} rays of {one.design.name} are drawn"
+        for one in shown.designs
+        if len(one.rays[0]) < one.fired
+    ]
     if shown.physics:
         left_out.append("the detector's effects decide what returns")
     further = "; ".join(left_out)

@@ -71,9 +71,11 @@ def paired_sensors(first: DesignSpec, second: DesignSpec) -> list[tuple[Sensor |
     # the difference of each sensor of one design from each of the other, shape (G, H) [m]
     distances_m = sum(np.linalg.norm(one[key][:, None] - other[key][None], axis=2) for key in one)
     rows, columns = linear_sum_assignment(distances_m)
-    pairs = [(first.sensors[row], second.sensors[column]) for row, column in zip(rows, columns, strict=True)]
-    pairs += [(sensor, None) for index, sensor in enumerate(first.sensors) if index not in rows]
-    return pairs + [(None, sensor) for index, sensor in enumerate(second.sensors) if index not in columns]
+    return [
+        *((first.sensors[row], second.sensors[column]) for row, column in zip(rows, columns, strict=True)),
+        *((sensor, None) for index, sensor in enumerate(first.sensors) if index not in rows),
+        *((None, sensor) for index, sensor in enumerate(second.sensors) if index not in columns),
+    ]
 
 
 @dataclass(frozen=True)

@@ -34,13 +34,14 @@ WEIGHT_SUM_TOLERANCE = SLACK
 COVARIANCE_ROUNDING = SLACK
 
 
-def _check_name(text: str) -> str:
+def check_name(text: str) -> str:
+    """The text, checked to be readable."""
     if not is_name(text):
         raise ValueError("is blank, or has control characters")
     return text
 
 
-Name = Annotated[str, AfterValidator(_check_name)]
+Name = Annotated[str, AfterValidator(check_name)]
 Coordinate = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M)]
 Distance = Annotated[float, Field(ge=0, le=FARTHEST_M)]
 Azimuth = Annotated[float, Field(ge=-LARGEST_ANGLE_RAD, le=LARGEST_ANGLE_RAD)]
@@ -51,13 +52,13 @@ Variance = Annotated[float, Field(ge=-(FARTHEST_M**2), le=FARTHEST_M**2)]
 Row = Annotated[list[Variance], Field(min_length=3, max_length=3)]
 
 
-class _Keys(BaseModel):
+class StrictKeys(BaseModel):
     """Unknown keys are errors; numbers are numbers, not text."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
 
 
-class OriginEntry(_Keys):
+class OriginEntry(StrictKeys):
     """The origin of a sensor [m], or the mean and covariance of a region in which its rays start [m^2]."""
 
     mean: Vector
@@ -73,7 +74,7 @@ class OriginEntry(_Keys):
         return self
 
 
-class BoresightEntry(_Keys):
+class BoresightEntry(StrictKeys):
     """The boresight of a sensor [rad]: azimuth from +x to +y, elevation up from the xy plane, roll about itself."""
 
     azimuth_rad: Azimuth
@@ -81,14 +82,14 @@ class BoresightEntry(_Keys):
     roll_rad: Azimuth = 0.0
 
 
-class FieldEntry(_Keys):
+class FieldEntry(StrictKeys):
     """Full angles in the boresight's own tangent plane."""
 
     horizontal: Extent
     vertical: Extent
 
 
-class GateEntry(_Keys):
+class GateEntry(StrictKeys):
     """The gate of a sensor as one-way distances [m]; the start is included, the end is not."""
 
     start: Distance
@@ -101,7 +102,7 @@ class GateEntry(_Keys):
         return self
 
 
-class SensorEntry(_Keys):
+class SensorEntry(StrictKeys):
     """A sensor; `weight` is its share of even rays, in proportion to the sum."""
 
     name: Name | None = None
@@ -113,7 +114,7 @@ class SensorEntry(_Keys):
     gate_m: GateEntry
 
 
-class PatternEntry(_Keys):
+class PatternEntry(StrictKeys):
     """A pattern: a table for each property of its rays, with a row for each knot of a condition."""
 
     dimension: Literal["x_m", "y_m", "z_m"] | None = None
@@ -150,13 +151,13 @@ COLUMNS = (
 )  # fmt: skip
 
 
-class MountEntry(_Keys):
+class MountEntry(StrictKeys):
     """The body of a robot that the sensors are mounted on, the frame of origins and directions."""
 
     body: Name
 
 
-class AdaptiveEntry(_Keys):
+class AdaptiveEntry(StrictKeys):
     """Patterns that follow what they see: the first fires where nothing is known, the others near their centroid."""
 
     looks: Annotated[int, Field(ge=0)] = 0
@@ -189,7 +190,7 @@ class AdaptiveEntry(_Keys):
         return self
 
 
-class DesignFile(_Keys):
+class DesignFile(StrictKeys):
     """A LiDAR design: sensors, the patterns that they fire, and the constraints that they keep. Metres and radians."""
 
     schema_version: Literal[2]

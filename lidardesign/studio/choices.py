@@ -9,22 +9,20 @@ from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from shlex import join
-from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
+from typing import Any, Literal, get_args, get_origin
 
 import numpy as np
 from pydantic import BaseModel
 
 from lidardesign.api.design import Design
+from lidardesign.api.run import Run
 from lidardesign.constraints.document import Constraints, SensorConstraints
 from lidardesign.constraints.slack import room_of, split_name
 from lidardesign.errors import ConfigError
 from lidardesign.run.validation import parse_override
 from lidardesign.run_folder import ignore
 from lidardesign.sensors.sensor import Sensor, boresight_frame
-
-if TYPE_CHECKING:
-    from lidardesign.api.run import Run
-    from lidardesign.task import Split
+from lidardesign.task import Split
 
 # What handles are rounded to, so that constraints are numbers that people can read.
 PLACE_DIGITS, ANGLE_DIGITS = 4, 2

@@ -127,8 +127,10 @@ class Stage:
 
     def show_sensors(self, sensors: Sequence[Sensor], chosen: str | None, beside: Colour | None = None) -> None:
         """Draw sensors with their fields of view and gates; the chosen one in another colour."""
-        pieces = [(_segments(frustum_lines(one)), one) for one in sensors]
-        pieces += [(_segments(origin_lines(one, DEFAULT_LEVEL)), one) for one in sensors]
+        pieces = [
+            *((_segments(frustum_lines(one)), one) for one in sensors),
+            *((_segments(origin_lines(one, DEFAULT_LEVEL)), one) for one in sensors),
+        ]
         shades = [np.tile(CHOSEN if one.name == chosen else beside or SENSOR, (len(lines), 1)) for lines, one in pieces]
         name = "/design" if beside is None else "/beside"
         self._lines(f"{name}/fields of view", np.concatenate([lines for lines, _ in pieces]), np.concatenate(shades))
@@ -253,5 +255,4 @@ def _box_edges(box: np.ndarray) -> np.ndarray:
     """The edges of a box (2, 3) as segments (12, 2, 3)."""
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
     ends = [(a, b) for a in corners for b in corners if (b - a).min() >= 0 and (b - a).sum() == 1]
-    places = np.where(np.array(ends, dtype=bool), box[1], box[0])
-    return np.asarray(places)
+    return np.where(np.array(ends, dtype=bool), box[1], box[0])

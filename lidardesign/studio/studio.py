@@ -10,13 +10,15 @@ from functools import partial
 from html import escape
 from pathlib import Path
 from queue import SimpleQueue
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from lidardesign.api.design import Design
-from lidardesign.api.run import FIXED_BASELINES
+from lidardesign.api.run import FIXED_BASELINES, Run
+from lidardesign.api.scores import Scores
 from lidardesign.api.training_scores import TrainingScores
+from lidardesign.clouds.seen import SeenScene
 from lidardesign.constraints.origins import SAME_PLACE_M, place_text
 from lidardesign.errors import BackgroundNote, ConfigError, LidardesignError
 from lidardesign.estimates import Interval, figure_and_interval
@@ -30,6 +32,7 @@ from lidardesign.run.manifest import write_recorded
 from lidardesign.run.yaml import dump_yaml
 from lidardesign.run_folder import ignore
 from lidardesign.samples import load_samples
+from lidardesign.scenes.scene import Scene
 from lidardesign.sensors.adaptive import mean_mbps
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.space import observed_point
@@ -37,14 +40,7 @@ from lidardesign.studio.choices import EVERY, MOUNT, Choices, SensorPose
 from lidardesign.studio.panel import BLIND, DENSITY, LAYERS, LIGHTS, NONE, SPLITS, STEPS, ControlPanel
 from lidardesign.studio.server import Worker, start_server, stop_server
 from lidardesign.studio.stage import BESIDE, COLOURS, Stage
-from lidardesign.task import random_generator
-
-if TYPE_CHECKING:
-    from lidardesign.api.run import Run
-    from lidardesign.api.scores import Scores
-    from lidardesign.clouds.seen import SeenScene
-    from lidardesign.scenes.scene import Scene
-    from lidardesign.task import Metric
+from lidardesign.task import Metric, random_generator
 
 DENSITY_POINTS = 3000
 MOST_UNDONE = 100
@@ -359,9 +355,11 @@ class Studio:
             f"{_figure(scores.score(choices.design), metric.unit)} {metric.name}, {metric.better} is better, "
             f"on {len(scores.scenes)} training scenes kept for comparing"
         ]
-        for name, other in (("before the last change", self._reference), (beside and beside.name, beside)):
-            if other is not None and other is not choices.design:
-                lines.append(f"{_compared(scores.difference(choices.design, other), metric)} than {name}")
+        lines += [
+            f"{_compared(scores.difference(choices.design, other), metric)} than {name}"
+            for name, other in (("before the last change", self._reference), (beside and beside.name, beside))
+            if other is not None and other is not choices.design
+        ]
         self._page.ask("scored", partial(self._show_status, choices, lines))
 
     def _show_status(self, choices: Choices, lines: list[str]) -> None:

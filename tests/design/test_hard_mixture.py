@@ -14,7 +14,7 @@ from support.mixtures import POINT, WHOLE, Z, drawn, features_of, random_mixture
 from lidardesign.constraints.document import Constraints
 from lidardesign.mixture.bounds import Bounds, Floors
 from lidardesign.mixture.components import Axes, Features, Mixture, expect, log_density, responsibilities
-from lidardesign.mixture.em import fit_mixture, run_em
+from lidardesign.mixture.em import fit_mixture, revive_dead, run_em
 from lidardesign.rays.proposals import Proposals
 from lidardesign.samples import Samples
 from lidardesign.sensors.design_file import design_document
@@ -117,7 +117,7 @@ class TestSamplesThatDoNotFillTheirSpace:
         rows = {name: getattr(good.mixture, name).copy() for name in good.mixture.__dataclass_fields__}
         rows["range_m"][2], rows["spread_range_m"][2] = 8.5, 1e-2
         rows["origin_m"][2], rows["weights"] = 8.0, np.array([0.5, 0.5, 1e-9])
-        trace = fit_mixture(features, bounds, generator, start=Mixture(**rows))
+        trace = revive_dead(run_em(Mixture(**rows), features, bounds), features, bounds, generator)
         assert any("restarted 1 of 3 sensors" in note for note in trace.notes)
         assert (trace.mixture.weights > 0.01).all()
         # it need not find the same optimum, but a better one than two sensors can

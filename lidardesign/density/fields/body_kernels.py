@@ -83,6 +83,14 @@ def _grid_distance(values, grids, g, q):  # noqa: ANN001, ANN202
     return distance, (x, y, z)
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _distance(kind, size, values, grids, g, q):  # noqa: ANN001, ANN202
+    """Signed distance of any body at a point in its own frame."""
+    if kind == GRID:
+        return _grid_distance(values, grids, g, q)[0]
+    return primitive_distance(kind, size, q)
+
+
 @njit(cache=True, nogil=True, fastmath=BOXES)
 def _outside_squared(edges, first, last, p, out) -> None:  # noqa: ANN001
     """Squared distances of a point to boxes `first` to `last`, 0 inside; edges (6, B) are low and then high sides."""
@@ -168,11 +176,7 @@ def near_columns(bodies, group_edges, points, log_weights, group_weights, precis
                 near = b
                 others = first
                 while b < last:
-                    q = placed(to_body, b, p)
-                    if kinds[b] == GRID:
-                        value = _grid_distance(values, grids, grid[b], q)[0]
-                    else:
-                        value = primitive_distance(kinds[b], row(sizes, b), q)
+                    value = _distance(kinds[b], row(sizes, b), values, grids, grid[b], placed(to_body, b, p))
                     if value < distance:
                         distance, body, limit = value, b, max(value, 0.0) * max(value, 0.0)
                     if others == first:
@@ -230,11 +234,7 @@ def distances_of(bodies, chosen, points, out):  # noqa: ANN001, ANN201
     kinds, sizes, to_body, grid, values, grids = bodies[:6]
     for n in range(points.shape[0]):
         b = chosen[n]
-        q = placed(to_body, b, row(points, n))
-        if kinds[b] == GRID:
-            out[n] = _grid_distance(values, grids, grid[b], q)[0]
-        else:
-            out[n] = primitive_distance(kinds[b], row(sizes, b), q)
+        out[n] = _distance(kinds[b], row(sizes, b), values, grids, grid[b], placed(to_body, b, row(points, n)))
 
 
 @njit(cache=True, nogil=True)
@@ -247,11 +247,7 @@ def all_distances(bodies, points, out, nearest):  # noqa: ANN001, ANN201
         p = row(points, n)
         for c in range(starts.shape[0] - 1):
             for b in range(starts[c], starts[c + 1]):
-                q = placed(to_body, b, p)
-                if kinds[b] == GRID:
-                    value = _grid_distance(values, grids, grid[b], q)[0]
-                else:
-                    value = primitive_distance(kinds[b], row(sizes, b), q)
+                value = _distance(kinds[b], row(sizes, b), values, grids, grid[b], placed(to_body, b, p))
                 if value < out[n, c]:
                     out[n, c] = value
                     nearest[n, c] = b

@@ -233,8 +233,11 @@ def _effect_measurements(bench: Bench, there: Sequence[str], *, marks: bool) -> 
     planned = [plan.effects & everything for plan in bench.plans]
     # compiled before anything is timed
     bench.score(0, everything, bench.planner.detector)
-    settings = {"none": [frozenset()] * count, "all": [everything] * count}
-    settings |= {f"without {name}": [everything - {name}] * count for name in there}
+    settings = {
+        "none": [frozenset()] * count,
+        "all": [everything] * count,
+        **{f"without {name}": [everything - {name}] * count for name in there},
+    }
     if planned not in settings.values():
         settings[bench.planner.choice if isinstance(bench.planner.choice, str) else "those named"] = planned
     alone = {f"{name} alone": [frozenset({name})] * count for name in there}

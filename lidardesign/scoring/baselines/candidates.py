@@ -120,8 +120,6 @@ def most_within(
     limit_mbps: float,
     bandwidth: Bandwidth,
     count: int,
-    *,
-    close_enough: float = 1.0,
 ) -> RaysPerCondition | None:
     """The most rays within a bandwidth that a few proportional steps find.
 
@@ -132,13 +130,12 @@ def most_within(
         limit_mbps: The bandwidth [Mbit/s].
         bandwidth: The read-out model.
         count: The number to begin with.
-        close_enough: The share of the bandwidth that ends the search.
     """
     low, high = 0, math.inf
     for _ in range(MOST_STEPS):
         cost = mean_mbps(lay_out(count), bandwidth)
         low, high = (count, high) if cost <= limit_mbps else (low, count)
-        if high - low <= 1 or close_enough * limit_mbps <= cost <= limit_mbps:
+        if high - low <= 1 or cost == limit_mbps:
             break
         guess = math.floor(count * limit_mbps / cost) if cost > 0 else 2 * count
         if guess > MOST_RAYS:

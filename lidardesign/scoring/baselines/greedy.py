@@ -13,14 +13,15 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, cached_property, partial
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 
 from lidardesign.numerics import COARSE_SLACK
+from lidardesign.rays.training_scenes import CHOICE, InformedScene, TrainingScenes
 from lidardesign.run.clock import phase
 from lidardesign.scenes.rays import Rays, fire_times
 from lidardesign.scoring.baselines.candidates import rays_at, rays_within, whole_range
@@ -35,7 +36,6 @@ from lidardesign.task import Task
 if TYPE_CHECKING:
     from lidardesign.rays.coverage import Coverage
     from lidardesign.rays.selection import Selection
-    from lidardesign.rays.training_scenes import InformedScene, TrainingScenes
 
 GREEDY = "greedy"
 USUAL_SCENES = 200  # that rays are chosen on where no design has a number of its own
@@ -96,7 +96,6 @@ class GreedyCandidate:
     candidates: int
     fired: Sequence[Fired]
     bandwidth: Bandwidth
-    _known: dict[tuple[int, float], RaysPerCondition] = field(default_factory=dict, repr=False)
 
     def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> RaysPerCondition:
         """See `Candidate`; in no more than the largest bandwidth of a design with so many rays."""
@@ -114,13 +113,13 @@ class GreedyCandidate:
         most = min(MOST_CHOSEN // len(gates_m), *(len(rays) for rays in self._proposed))
         return self._chosen(min(fit, most), np.inf)
 
-    def _chosen(self, count: int, limit_mbps: float) -> RaysPerCondition:
-        """The choice of `count` rays at each value, within a bandwidth that is a mean over the values [Mbit/s]."""
-        if (count, limit_mbps) not in self._known:
-            self._known[count, limit_mbps] = self._choice(count, limit_mbps)
-        return self._known[count, limit_mbps]
+    @cached_property
+    def _chosen(self) -> Callable[[int, float], RaysPerCondition]:
+        """`_choice`, which is made once."""
+        return cache(self._choice)
 
     def _choice(self, count: int, limit_mbps: float) -> RaysPerCondition:
+        """The choice of `count` rays at each value, within a bandwidth that is a mean over the values [Mbit/s]."""
         from lidardesign.rays.choice import choose, choose_within
 
         table, values = self._table, len(self.spaces)
@@ -177,7 +176,6 @@ class GreedyCandidate:
     @cached_property
     def _table(self) -> _Table:
         from lidardesign.rays.selection import Selection
-        from lidardesign.rays.training_scenes import CHOICE
 
         ends = np.cumsum([0, *map(len, self._proposed)]).tolist()
         visits = [slice(*pair) for pair in itertools.pairwise(ends)]

@@ -24,6 +24,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -105,7 +106,8 @@ class Baselines:
         self.gates_per_ray = gates_per_ray
         self.without_visibility, self.optimised, self.chosen = without_visibility, optimised, chosen
         self._judge = judge
-        self._candidates: dict[str, Sequence[Candidate]] = {}
+        # laid out once
+        self.candidates = cache(self._candidates)
         self._scores: dict[tuple[str, str, int], float] = {}
 
     def options(self, name: str, count: int) -> list[Option]:
@@ -125,16 +127,14 @@ class Baselines:
             options.append(Option(one, positions))
         return options
 
-    def candidates(self, name: str) -> Sequence[Candidate]:
+    def _candidates(self, name: str) -> Sequence[Candidate]:
         """The layouts that a baseline chooses from; those of `uniform` where no training scene returns anything.
 
         Raises:
             ConfigError: There is no such baseline.
         """
-        if name not in self._candidates:
-            check_baseline(name)
-            self._candidates[name] = BASELINES[name](self) or _uniform(self)
-        return self._candidates[name]
+        check_baseline(name)
+        return BASELINES[name](self) or _uniform(self)
 
     @phase("baselines")
     def best(self, choices: Sequence[tuple[str, list[Option]]]) -> list[Option]:

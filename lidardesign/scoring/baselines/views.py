@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -134,23 +134,19 @@ class TrainingViews:
 
     def __init__(self, space: DesignSpace, train: Sequence[Scene]) -> None:
         self.space, self.train = space, train
-        self._observed: dict[DesignSpace, np.ndarray] = {}
+        # traced once
+        self.observed = cache(self._traced)
 
     @cached_property
     def casters(self) -> list[tuple[Scene, SceneCaster]]:
         """A caster per scene and frame, built once."""
         return [(self.train[i], SceneCaster(self.train[i], frame)) for i, frame in spread_frames(self.train)]
 
-    def observed(self, space: DesignSpace) -> np.ndarray:
+    def _traced(self, space: DesignSpace) -> np.ndarray:
         """Design points of dense rays over a part of the design space, even in its own measure, that return; (K, 6).
 
-        They are traced once; azimuths are unrolled to one arc.
+        Azimuths are unrolled to one arc.
         """
-        if space not in self._observed:
-            self._observed[space] = self._traced(space)
-        return self._observed[space]
-
-    def _traced(self, space: DesignSpace) -> np.ndarray:
         axes = [i for i, dimension in enumerate(space.free) if dimension != RANGE]
         count = dense_rays(len(axes))
         unit = np.full((count, len(space.free)), -1.0)

@@ -164,7 +164,7 @@ def load_capture(path: Path) -> Capture:
         DataError: The file cannot be read, a key is missing, unknown or in another unit, or a value cannot be.
     """
     where = str(path)
-    arrays = read_arrays(Path(path))
+    arrays = read_arrays(path)
     for name in arrays:
         if name not in KEYS:
             same = [key for key in KEYS if key.rpartition("_")[0] and name.startswith(key.rpartition("_")[0] + "_")]
@@ -315,7 +315,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     Raises:
         DataError: The file is missing, damaged, too large, or holds something else than arrays of numbers.
     """
-    path, where = Path(path), str(path)
+    where = str(path)
     if path.suffix.lower() not in SUFFIXES:
         raise DataError(f"has the suffix {path.suffix!r}", where=where, allowed=", ".join(SUFFIXES))
     if not check_file(path, CAPTURE, hint="check the path"):
@@ -415,5 +415,9 @@ def convert(request: dict[str, Any], _: object) -> dict[str, Any]:
 
 def refused(name: str, kind: str, where: str) -> DataError:
     """The error for a variable that is no full array of real numbers."""
-    allowed, hint = "full numeric arrays", "save arrays, not structures"
-    return DataError(f"{name!r} is a MATLAB {kind}", where=where, allowed=allowed, hint=hint)
+    return DataError(
+        f"{name!r} is a MATLAB {kind}",
+        where=where,
+        allowed="full numeric arrays",
+        hint="save arrays, not structures",
+    )

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from lidardesign.errors import ThresholdError
 from lidardesign.estimates import figure_and_interval
-from lidardesign.scoring.evaluation.results import BY_HAND, Evaluation, Paired, Row, verdict
+from lidardesign.scoring.evaluation.results import BY_HAND, Evaluation, Paired, verdict
 
 
 def comparison(pair: Paired, better: str, unit: str) -> str:
@@ -80,25 +80,20 @@ def _verdicts(evaluation: Evaluation) -> str:
     return "; ".join(parts)
 
 
-def worse_than_threshold(evaluation: Evaluation, limit: float) -> list[Row]:
-    """Rows of designs whose mean misses a limit in the metric's unit; baselines never count.
+def check_limit(evaluation: Evaluation, limit: float) -> None:
+    """Refuse designs that are worse than a limit in the metric's unit; baselines never count.
 
     Where lower is better, a row misses the limit by lying above it; where higher is better, by lying below
     it: `--fail-above` then reads as "fail where worse than". A value equal to the limit meets it.
-    """
-    sign = 1.0 if evaluation.metric.better == "lower" else -1.0
-    return [row for row in evaluation.rows if not row.baseline and sign * row.value > sign * limit]
-
-
-def check_limit(evaluation: Evaluation, limit: float) -> None:
-    """Refuse designs that are worse than a limit in the metric's unit.
 
     Raises:
         ThresholdError: One is, at one of the numbers of rays.
     """
-    missed, unit = worse_than_threshold(evaluation, limit), evaluation.metric.unit
+    unit, is_lower = evaluation.metric.unit, evaluation.metric.better == "lower"
+    rows = [row for row in evaluation.rows if not row.baseline]
+    missed = [row for row in rows if (row.value > limit if is_lower else row.value < limit)]
     if missed:
-        bound = "at most" if evaluation.metric.better == "lower" else "at least"
+        bound = "at most" if is_lower else "at least"
         rows = ", ".join(f"{row.design} at {row.rays} rays: {row.value:.4g} {unit}" for row in missed)
         raise ThresholdError(rows, where="--fail-above", allowed=f"{bound} {limit:g} {unit}")
 

@@ -11,21 +11,18 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from lidardesign.estimates import HALF_INTERVAL, Estimate, Interval, as_documents, paired_difference
 from lidardesign.run.arrays import csv_table
 from lidardesign.run.files import write_atomic
-from lidardesign.scoring.evaluation.entries import EffectSummary
+from lidardesign.scoring.baselines.cma import SearchRecord
+from lidardesign.scoring.evaluation.entries import EffectSummary, StrongestBaseline
 from lidardesign.scoring.evaluation.mounting import MountError
 from lidardesign.scoring.sweep import Accuracy
 from lidardesign.task import Metric
-
-if TYPE_CHECKING:
-    from lidardesign.scoring.baselines.cma import SearchRecord
-    from lidardesign.scoring.evaluation.entries import StrongestBaseline
 
 # What one would place without a design: a grid over everything, and one cropped to what returns.
 BY_HAND = ("uniform", "bounding")

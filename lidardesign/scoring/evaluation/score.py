@@ -75,12 +75,16 @@ def evaluate(request: EvaluationRequest, progress: Progress | None = None) -> Ev
     request.check()
     entries = entries_of(request)
     passes = 1 + request.audit + bool(request.losing) + (request.mount_error is not None)
-    scored = _score_all(request, entries, request.planner, _part(progress, 0, passes))
-    losses = _losses(request, entries, scored.plans, _part(progress, 1, passes)) if request.losing else {}
+    scored = _score_all(request, entries, request.planner, progress_of_part(progress, 0, passes))
+    losses = _losses(request, entries, scored.plans, progress_of_part(progress, 1, passes)) if request.losing else {}
     rows = [replace(row, lost=losses.get(n, ())) for n, row in enumerate(_rows(request, entries, scored))]
     effects = effect_summaries(scored.plans)
-    audit = _audit(request, entries, rows, scored.plans, _part(progress, passes - 2, passes)) if request.audit else None
-    last = _part(progress, passes - 1, passes)
+    audit = (
+        _audit(request, entries, rows, scored.plans, progress_of_part(progress, passes - 2, passes))
+        if request.audit
+        else None
+    )
+    last = progress_of_part(progress, passes - 1, passes)
     mounting = request.mount_error and _mounting(request, request.mount_error, entries, rows, scored.plans, last)
     searches = [entry.search for entry in entries if entry.search is not None]
     plain = [row for row in rows if row.matched_to is None]
@@ -110,10 +114,11 @@ def evaluate(request: EvaluationRequest, progress: Progress | None = None) -> Ev
     )
 
 
-def _part(progress: Progress | None, number: int, passes: int) -> Progress | None:
+def progress_of_part(progress: Progress | None, number: int, parts: int) -> Progress | None:
+    """Progress within one of several parts of a work, as progress within all of it."""
     if progress is None:
         return None
-    return lambda name, done, total: progress(name, number * total + done, passes * total)
+    return lambda name, done, total: progress(name, number * total + done, parts * total)
 
 
 @phase("audit")
@@ -286,8 +291,7 @@ def _notes(request: EvaluationRequest, entries: Sequence[Entry], matched: Sequen
     own = sorted((entry for entry in entries if not entry.baseline), key=lambda entry: entry.rays)
     shared = [entry for entry in own if entry.rays not in request.alone]
     # of each design the most rays, which come last
-    fired = {f"{entry.name!r}": entry.positions for entry in own}
-    notes += silent_notes(request.test, fired)
+    notes += silent_notes(request.test, {f"{entry.name!r}": entry.positions for entry in own})
     found = {(row.matched_to, row.matched_rays, row.design) for row in matched}
     beyond = {
         (entry.name, name)
@@ -345,9 +349,9 @@ def slipped_notes(casts: SecondCasts) -> list[str]:
     """A line on rays that slipped between the triangles of meshes, where they are more than outlines explain."""
     if casts.found <= OUTLINE_SHARE * casts.rays:
         return []
-    note = f"{casts.found:,} of {casts.rays:,} rays ({casts.found / casts.rays:.2%}) had slipped between triangles, as "
     return [
         BackgroundNote(
-            f"{note}happens at the vertices of a mesh; a second cast, slightly shifted, found what they meet"
+            f"{casts.found:,} of {casts.rays:,} rays ({casts.found / casts.rays:.2%}) had slipped between triangles, "
+            "as happens at the vertices of a mesh; a second cast, slightly shifted, found what they meet"
         )
     ]
