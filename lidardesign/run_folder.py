@@ -6,6 +6,7 @@ import contextlib
 import json
 import logging
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -14,10 +15,10 @@ from typing import TYPE_CHECKING, Any
 from lidardesign.config import RunConfig, load_run_config, with_task_settings
 from lidardesign.errors import LidardesignError
 from lidardesign.registry import plugin_guard
-from lidardesign.run.clock import phase
+from lidardesign.run.clock import WAIT_S, phase
 from lidardesign.run.files import sha256_file
 from lidardesign.run.inputs import MESH
-from lidardesign.run.manifest import read_manifest
+from lidardesign.run.manifest import locked_run, read_manifest
 from lidardesign.scenes.scene import Scene
 from lidardesign.space import DesignSpace
 from lidardesign.task import FolderConfig, Metric, Split, Task, conditions_of, metric_of, scenes_of
@@ -47,11 +48,12 @@ def log_note(text: str) -> None:
 
 @dataclass(frozen=True)
 class RunFolder:
-    """An open run folder with its task and configuration."""
+    """An open run folder with its task and configuration, and when it was made; None: not to be compared."""
 
     folder: Path
     task: Task
     config: RunConfig
+    created: str | None = None
 
     @classmethod
     def open(cls, folder: Path | str) -> Self:
@@ -61,7 +63,11 @@ class RunFolder:
             DataError: There is none, or it is damaged.
         """
         folder = Path(folder)
-        return cls(folder, *load_run_config(folder))
+        return cls(folder, *load_run_config(folder), read_manifest(folder).get("created"))
+
+    def lock(self, wait_s: float = WAIT_S) -> AbstractContextManager[Any]:
+        """Hold its lock, if it is still the run that was opened; see `locked_run`."""
+        return locked_run(self.folder, self.created, wait_s)
 
     def design_path(self, name: str) -> Path:
         """Path of a design file of this run."""
@@ -114,8 +120,8 @@ class RunFolder:
         changed = [name for name, digest in moved.items() if digest not in renamed]
         notes = task.twin_notes() if isinstance(task, FolderConfig) else []
         if changed:
-            named = _named([f"{name} {'changed' if Path(name).exists() else 'is gone'}" for name in changed])
-            notes.append(f"{named} since {self.folder} was learned: its scenes are different now")
+            moves = named([f"{name} {'changed' if Path(name).exists() else 'is gone'}" for name in changed])
+            notes.append(f"{moves} since {self.folder} was learned: its scenes are different now")
         came = [
             Path(name).name
             for name, digest in now.items()
@@ -123,7 +129,7 @@ class RunFolder:
         ]
         if came:
             left_out = f"added after {self.folder} was learned, so left out; learn again to include what is new"
-            notes.append(f"{_named(came)}: {left_out}")
+            notes.append(f"{named(came)}: {left_out}")
         return notes
 
     def design_paths(self) -> list[Path]:
@@ -147,7 +153,7 @@ class RunFolder:
         }
 
 
-def _named(names: Sequence[str]) -> str:
+def named(names: Sequence[str]) -> str:
     """The first of some names, and how many more there are."""
     return ", ".join(names[:MOST_NAMED]) + (f" and {len(names) - MOST_NAMED} more" if names[MOST_NAMED:] else "")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -15,13 +16,12 @@ from lidardesign.config import RunConfig, load_run_config, resolve, save_run_con
 from lidardesign.errors import BackgroundNote, ConfigError, DataError, ThresholdError, check_choice, check_number
 from lidardesign.registry import distribution_of, load_task, plugin_guard, task_names
 from lidardesign.run.clock import WAIT_S, Clock, outermost_clock, phase
-from lidardesign.run.files import is_temporary, run_lock, writer
+from lidardesign.run.files import exchange, is_held, is_temporary, remove, run_lock, writer
 from lidardesign.run.manifest import note, start_manifest
-from lidardesign.run.outputs import check_writable
+from lidardesign.run.outputs import check_writable, files_of_run
 from lidardesign.run.yaml import leaves, load_yaml
 from lidardesign.run_folder import (
     CONFIGURATION,
-    DESIGN_FOLDER,
     INPUTS,
     MANIFEST,
     SAMPLES,
@@ -30,6 +30,7 @@ from lidardesign.run_folder import (
     input_hashes,
     input_paths,
     log_note,
+    named,
     settings_texts,
 )
 from lidardesign.task import FolderConfig, Task, notes_of
@@ -161,9 +162,15 @@ class LearnRequest:
             settings = _with_inputs(resolve(plugin, **choices))
         request = cls(plugin, folder, settings, options, begun, replaces)
         if replaces:
-            designs = ", ".join(sorted(path.stem for path in (folder / DESIGN_FOLDER).glob("*.yaml")))
-            lost = f", with its designs ({designs})" if designs else ""
-            notes(f"once it is learned it replaces the run {folder}{lost}")
+            kept = list(map(str, kept_files(folder)))
+            designs = [
+                path.stem
+                for path in RunFolder(folder, plugin, settings).design_paths()
+                if str(path.relative_to(folder)) not in kept
+            ]
+            lost = f", with its designs ({', '.join(designs)})" if designs else ""
+            stays = f"; what is not of the run stays: {named(kept)}" if kept else ""
+            notes(f"once it is learned it replaces the run {folder}{lost}{stays}")
         for line in RunFolder(place, plugin, settings).input_notes() if begun else ():
             notes(line)
         if begun and not request.has_checkpoint:
@@ -297,14 +304,14 @@ class LearnRequest:
         try:
             yield
         except BaseException:
-            entries = [entry for entry in self.place.iterdir() if entry.name != LOCK]
+            entries = [entry for entry in self.place.glob("*") if entry.name != LOCK]
             nothing_learned = all(entry.name in STARTED_FILES or entry.stat().st_size == 0 for entry in entries)
             if not self.begun and nothing_learned:
                 with contextlib.suppress(OSError):
                     # without its configuration a run has not begun, whatever else is left of it
                     (self.place / CONFIGURATION).unlink(missing_ok=True)
                     for entry in entries:
-                        shutil.rmtree(entry) if entry.is_dir() else entry.unlink(missing_ok=True)
+                        remove(entry)
             raise
 
 
@@ -380,6 +387,8 @@ def _holds_run(folder: Path) -> bool:
         ConfigError: It holds something else, is being written, or an earlier replacement was killed halfway.
     """
     where, aside = f"--out {folder}", next_to(folder, OLD)
+    if folder.is_dir() and is_held(folder.resolve()):
+        raise ConfigError("is a mount point, or holds the working folder: it cannot be replaced", where=where)
     if aside.exists():
         hint = "move or remove it"
         if not folder.exists():
@@ -403,24 +412,40 @@ def next_to(folder: Path, suffix: str) -> Path:
 def put_in_place(folder: Path) -> None:
     """Move the run that was learned beside a folder into its place, then delete the old one.
 
+    What the old one did not record is in the new one too before it takes its place.
+
     Raises:
         DataError: Somebody is writing the old one, or the folders cannot be renamed; both are kept.
     """
     place, new, aside = (next_to(folder, suffix) for suffix in ("", NEW, OLD))
     try:
         with run_lock(place, wait_s=WAIT_S):
-            place.rename(aside)
-            try:
-                new.rename(place)
-            except OSError:
-                aside.rename(place)
-                raise
+            for path in kept_files(place):
+                (new / path).parent.mkdir(parents=True, exist_ok=True)
+                os.link(place / path, new / path, follow_symlinks=False)
+            if exchange(new, place):
+                new.rename(aside)
+            else:
+                place.rename(aside)
+                try:
+                    new.rename(place)
+                except OSError:
+                    aside.rename(place)
+                    raise
     except (ConfigError, OSError) as error:
         reason = error.message if isinstance(error, ConfigError) else error.strerror or error
         hint = "the new run is finished: use it where it is, or move it"
         raise DataError(f"cannot replace {folder}: {reason}", where=str(new), hint=hint) from error
     # what cannot be removed is named by the next replacement
     shutil.rmtree(aside, ignore_errors=True)
+
+
+def kept_files(run: Path) -> list[Path]:
+    """Paths in a run's folder of what the run did not record, so that it outlasts the run."""
+    own = files_of_run(run)
+    paths = [path for path in run.rglob("*") if path.is_symlink() or not path.is_dir()]
+    within = sorted(path.relative_to(run) for path in paths if not is_temporary(path.name))
+    return [path for path in within if path.as_posix() not in own]
 
 
 def _was_killed_before_it_began(run: Path) -> bool:

@@ -13,9 +13,9 @@ from lidardesign.errors import ConfigError
 from lidardesign.formats.meshes import FACES, ply_file
 from lidardesign.formats.mount_page import mounted_parts
 from lidardesign.formats.mounts import quaternion
-from lidardesign.formats.names import identifier, write_folder
+from lidardesign.formats.names import identifier
 from lidardesign.formats.robots import WORLD
-from lidardesign.run.files import write_atomic
+from lidardesign.run.files import write_atomic, write_folder
 from lidardesign.scenes.rays import DEFAULT_RATE_HZ, Outcome
 
 FORMATS = ("ply", "pcd", "mcap")

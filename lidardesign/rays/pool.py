@@ -112,8 +112,8 @@ def cached_information(
     buffer = io.BytesIO()
     np.savez(buffer, key=np.frombuffer(key.encode(), dtype=np.uint8), **arrays)
     if buffer.tell() <= MOST_BYTES:
-        # a run that cannot be written, or a full disk, costs time alone
-        with contextlib.suppress(LidardesignError):
+        # a run that is gone or cannot be written, or a full disk, costs time alone
+        with contextlib.suppress(LidardesignError), training.run.lock(wait_s=0.0):
             write_atomic(path, buffer.getvalue())
     # rounded as the file rounds it
     return _unpacked(arrays)

@@ -110,7 +110,13 @@ def peak_memory_bytes() -> int | None:
 
 
 def keep_timings(
-    run: Path, command: str, clock: Clock, *, wait_s: float = WAIT_S, further: Mapping[str, Any] | None = None
+    run: Path,
+    command: str,
+    clock: Clock,
+    *,
+    wait_s: float = WAIT_S,
+    created: str | None = None,
+    further: Mapping[str, Any] | None = None,
 ) -> None:
     """Enter a command's times in a run's manifest, in place of those of the last time, under the run's lock.
 
@@ -119,14 +125,14 @@ def keep_timings(
         command: Its name.
         clock: Its clock.
         wait_s: Time to wait for another writer [s].
+        created: When the run was made that must be in it; None: any.
         further: Mappings of the manifest that get further entries, by name.
 
     Raises:
         ConfigError, DataError: The run is being written, or cannot be.
     """
     # every command has a clock, `--help` too: what only some need is not imported for all
-    from lidardesign.run.files import run_lock
-    from lidardesign.run.manifest import read_manifest, write_manifest
+    from lidardesign.run.manifest import locked_run, write_manifest
 
     entry: dict[str, Any] = {
         "when": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -134,8 +140,7 @@ def keep_timings(
         "peak_memory_bytes": peak_memory_bytes(),
         "phases": clock.timings(),
     }
-    with run_lock(run, wait_s=wait_s):
-        manifest = read_manifest(run)
+    with locked_run(run, created, wait_s) as manifest:
         commands = {name: times for name, times in manifest.get("timings", {}).items() if isinstance(times, dict)}
         merged = {name: {**(manifest.get(name) or {}), **entries} for name, entries in (further or {}).items()}
         write_manifest(run, {**manifest, "timings": {**commands, command: entry}, **merged})

@@ -1,6 +1,6 @@
-"""Files that are either whole or absent.
+"""Files that are either whole or absent, and folders that are the old or the new one, or name what is unfinished.
 
-A temporary file names its process, and is removed once that process is gone.
+What is temporary names its process, and is removed once that process is gone.
 
 One writer per run folder: a lock of the operating system, which frees it however its process ends.
 
@@ -10,18 +10,22 @@ The lock file names who holds it; it is there for as long as it is held.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import functools
 import hashlib
 import json
 import os
 import re
 import secrets
+import shutil
 import socket
-from collections.abc import Iterator
+import sys
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.run.inputs import RECORD, STATE, check_file, parse_json, read_file
+from lidardesign.run.clock import WAIT_S
+from lidardesign.run.inputs import RECORD, STATE, UNFINISHED, check_file, parse_json, read_file, unfinished_names
 
 HOST_DIGITS = 8
 
@@ -82,10 +86,7 @@ def write_atomic(path: Path, content: bytes | str) -> None:
             temporary = temporary_beside(path)
             _remove_abandoned(temporary)
             try:
-                with temporary.open("xb") as file:
-                    file.write(payload)
-                    file.flush()
-                    os.fsync(file.fileno())
+                _write_new(temporary, payload)
                 os.replace(temporary, path)
             except BaseException:
                 with contextlib.suppress(OSError):
@@ -102,6 +103,14 @@ def write_atomic(path: Path, content: bytes | str) -> None:
         raise
     except OSError as error:
         raise _unwritten(path, error) from error
+
+
+def _write_new(path: Path, payload: bytes) -> None:
+    """Write a file that is not there yet, to the disk."""
+    with path.open("xb") as file:
+        file.write(payload)
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def _write_straight(path: Path, payload: bytes) -> None:
@@ -138,13 +147,129 @@ def temporary_beside(path: Path) -> Path:
 
 
 def _remove_abandoned(temporary: Path) -> None:
-    """Remove the temporary files of the same target that processes of this computer left when they were killed."""
+    """Remove what is temporary of the same target and was left by processes of this computer that were killed."""
     beginning = temporary.name.rsplit("-", 1)[0]
     for name in os.listdir(temporary.parent):
         found = _TEMPORARY.fullmatch(name) if name.startswith(beginning) else None
         if found and is_gone(int(found["pid"])):
             with contextlib.suppress(OSError):
-                temporary.with_name(name).unlink()
+                remove(temporary.with_name(name))
+
+
+def remove(path: Path) -> None:
+    """Remove a file, or a folder with all that is in it."""
+    shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink(missing_ok=True)
+
+
+# Most names of other files in a note; the rest is counted.
+MOST_NAMED = 5
+# Of the system call renameat2: paths as they are, and both of them exchanged.
+_FROM_HERE, _EXCHANGE = -100, 2
+
+
+def write_folder(path: Path, files: Mapping[str, bytes]) -> list[str]:
+    """Write a set of files as a folder, of which a reader, or a kill at any time, finds the old or the new one.
+
+    They are written to a folder beside it, which takes its place in one step. A folder that also holds other files, or
+    is a mount point or the working folder, stays: its files are replaced one by one while `UNFINISHED` names them.
+
+    Arguments:
+        path: The folder; missing folders are made.
+        files: Content by name; names of files in subfolders have forward slashes.
+
+    Returns:
+        Notes on other files in it, as of an earlier export, which stay, and on a set that was unfinished.
+
+    Raises:
+        DataError: A file has that name, the folder cannot be written, or another process is writing it.
+    """
+    place, others = Path(os.path.realpath(path)), list[str]()
+    try:
+        if place.is_dir():
+            others = sorted({*os.listdir(place)} - {Path(name).parts[0] for name in files})
+        elif place.exists():
+            raise DataError(
+                "is a file, and this is a folder of files", where=str(path), hint="give the name of a folder"
+            )
+        if not (_can_be_exchanged(place, files) and _replaced(place, files)):
+            _fill(place, files)
+    except OSError as error:
+        raise _unwritten(path, error) from error
+    notes = ["a set of files that was left unfinished there is whole now"] if UNFINISHED in others else []
+    if others := [name for name in others if name[0] != "." and name != UNFINISHED]:
+        named = ", ".join(others[:MOST_NAMED]) + (", ..." if len(others) > MOST_NAMED else "")
+        notes.append(f"the folder also holds {len(others)} other files, which stay as they are: {named}")
+    return notes
+
+
+def _can_be_exchanged(place: Path, names: Collection[str]) -> bool:
+    """True for a folder that is not there, or has nothing but a set's own files and may be exchanged with another."""
+    return not place.exists() or (
+        all(entry.name in names and entry.is_file(follow_symlinks=False) for entry in os.scandir(place))
+        and os.access(place.parent, os.W_OK)
+        and not is_held(place)
+    )
+
+
+def is_held(folder: Path) -> bool:
+    """True for a mount point, and where this process works inside a folder: another one cannot take its place."""
+    return os.path.ismount(folder) or Path.cwd().is_relative_to(os.path.realpath(folder))
+
+
+@contextlib.contextmanager
+def _staged(beside: Path, files: Mapping[str, bytes]) -> Iterator[Path]:
+    """A temporary folder beside a path, with files; whatever is there at the end is removed."""
+    folder = temporary_beside(beside)
+    beside.parent.mkdir(parents=True, exist_ok=True)
+    _remove_abandoned(folder)
+    try:
+        for name, content in files.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            _write_new(folder / name, content)
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _replaced(place: Path, files: Mapping[str, bytes]) -> bool:
+    """Put a new folder in place of one; False where only its files can be replaced."""
+    with _staged(place, files) as folder:
+        if not place.exists():
+            os.rename(folder, place)
+            return True
+        old, new = place.stat(), folder.stat()
+        # whose it is, and who may read it, stays
+        if (old.st_uid, old.st_gid, old.st_mode) != (new.st_uid, new.st_gid, new.st_mode):
+            return False
+        if not exchange(folder, place):
+            return False
+        for name in {*os.listdir(folder)} - {*files}:  # what came meanwhile
+            os.rename(folder / name, place / name)
+        return True
+
+
+def exchange(one: Path, other: Path) -> bool:
+    """Exchange two folders in one step; False where the system, or the file system, cannot."""
+    call = getattr(ctypes.CDLL(None), "renameat2", None) if sys.platform == "linux" else None
+    return call is not None and not call(_FROM_HERE, os.fsencode(one), _FROM_HERE, os.fsencode(other), _EXCHANGE)
+
+
+def _fill(place: Path, files: Mapping[str, bytes]) -> None:
+    """Replace the files of a set in a folder; a file that lists them is there, and locked, until all of them are."""
+    from filelock import FileLock
+
+    marker = place / UNFINISHED
+    for name in files:
+        (place / name).parent.mkdir(parents=True, exist_ok=True)
+        if (place / name).is_dir():
+            raise DataError("is a folder", where=str(place / name), hint="move it, or give another place")
+    with _staged(marker, files) as folder, FileLock(marker, timeout=WAIT_S):
+        left = [name for name in unfinished_names(place) if name not in files]
+        marker.write_text("\n".join([*files, *left]), encoding="utf-8")
+        for name in files:
+            os.replace(folder / name, os.path.realpath(place / name))
+        # removed while locked, so that a process that opened it meanwhile finds it gone
+        marker.write_text("\n".join(left), encoding="utf-8") if left else marker.unlink()
 
 
 def is_temporary(name: str) -> bool:
@@ -153,7 +278,7 @@ def is_temporary(name: str) -> bool:
 
 
 def remove_stray_temporaries(folder: Path) -> list[Path]:
-    """Remove temporary files that killed processes left in a folder and its subfolders; returns what was removed.
+    """Remove what killed processes left temporarily in a folder and its subfolders; returns what was removed.
 
     Call it only while no other computer writes there (the run's lock is held).
     """
@@ -163,7 +288,7 @@ def remove_stray_temporaries(folder: Path) -> list[Path]:
         at_work = found and found["host"] == host_mark() and not is_gone(int(found["pid"]))
         if found and not at_work:
             with contextlib.suppress(OSError):
-                stray.unlink()
+                remove(stray)
                 removed.append(stray)
     return removed
 
@@ -208,11 +333,13 @@ def run_lock(run: Path, *, wait_s: float = 0.0) -> Iterator[None]:
 
     Raises:
         ConfigError: Another process writes this run.
-        DataError: The folder cannot be written.
+        DataError: The folder is gone, or cannot be written.
     """
     from filelock import FileLock, Timeout
 
     path = Path(run) / FILE_NAME
+    if not path.parent.is_dir():  # the lock would make it
+        raise DataError("no such run", where=str(run))
     check_lock(run)
     lock = FileLock(path)
     try:

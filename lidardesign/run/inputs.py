@@ -17,6 +17,8 @@ from lidardesign.errors import ConfigError, DataError
 
 HEAD_BYTES = 4096
 FILE_HINT = "give a file"
+# In a folder whose files are only partly those of a new set: their names, one a line.
+UNFINISHED = "lidardesign-unfinished.txt"
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,7 @@ def check_file(path: Path | str, kind: Kind, *, allowed: str | None = None, hint
     """The size of a file [bytes], checked to be a regular file within its kind's limit.
 
     Raises:
-        DataError, ConfigError: By the kind: it is missing, no regular file, or too large.
+        DataError, ConfigError: By the kind: it is missing, no regular file, too large, or of an unfinished set.
     """
     try:
         status = os.stat(path)
@@ -77,7 +79,16 @@ def check_file(path: Path | str, kind: Kind, *, allowed: str | None = None, hint
     if not stat.S_ISREG(status.st_mode):
         raise kind.error("is not a regular file", where=str(path), allowed=allowed, hint=hint or FILE_HINT)
     check_bytes(status.st_size, kind, str(path))
+    if os.path.basename(path) in unfinished_names(Path(path).parent):
+        hint = f"write them again; {UNFINISHED} beside it names them all"
+        raise kind.error("is one of a set of files of which only some were replaced", where=str(path), hint=hint)
     return status.st_size
+
+
+def unfinished_names(folder: Path) -> list[str]:
+    """The names of the files of a set in a folder that was left unfinished; none where all are whole."""
+    marker = folder / UNFINISHED
+    return marker.read_text(encoding="utf-8", errors="replace").splitlines() if marker.is_file() else []
 
 
 def check_bytes(size: int, kind: Kind, where: str, *, unpacked: bool = False) -> None:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import platform
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -13,7 +14,8 @@ from typing import Any
 
 from lidardesign import __version__
 from lidardesign.errors import DataError
-from lidardesign.run.files import sha256_file, write_atomic, writer
+from lidardesign.run.clock import WAIT_S
+from lidardesign.run.files import run_lock, sha256_file, write_atomic, writer
 from lidardesign.run.inputs import RECORD, parse_json, read_file
 
 FILE_NAME = "manifest.json"
@@ -99,6 +101,26 @@ def read_manifest(run: Path) -> dict[str, Any]:
     return manifest
 
 
+@contextlib.contextmanager
+def locked_run(run: Path, created: str | None = None, wait_s: float = WAIT_S) -> Iterator[dict[str, Any]]:
+    """Hold the lock of a run that is still there, and give its manifest.
+
+    Arguments:
+        run: The run folder.
+        created: When the run was made that must be in it; None: any.
+        wait_s: Time to wait for another writer [s].
+
+    Raises:
+        ConfigError: Another process writes this run.
+        DataError: It is gone, another run is in its folder, or it cannot be written.
+    """
+    with run_lock(run, wait_s=wait_s):
+        manifest = read_manifest(run)
+        if created not in (None, manifest.get("created")):
+            raise DataError("another run has taken its place meanwhile", where=str(run), hint="give the command again")
+        yield manifest
+
+
 def write_manifest(run: Path, manifest: dict[str, Any]) -> None:
     """Replace the manifest of a run, atomically."""
     write_atomic(Path(run) / FILE_NAME, json.dumps(manifest, indent=2) + "\n")
@@ -107,7 +129,7 @@ def write_manifest(run: Path, manifest: dict[str, Any]) -> None:
 def record(run: Path, names: Iterable[str]) -> None:
     """Enter the present size and SHA-256 of files of a run (names relative to it, with forward slashes)."""
     run = Path(run)
-    manifest = read_manifest(run) if (run / FILE_NAME).exists() else start_manifest(run, command=[], seed=0)
+    manifest = read_manifest(run)
     for name in names:
         path = run / name
         manifest["files"][Path(name).as_posix()] = {"sha256": sha256_file(path), "bytes": path.stat().st_size}
@@ -133,7 +155,7 @@ def announce(run: Path, name: str, content: bytes) -> None:
     A process that is killed between the two writes then leaves a file that still verifies.
     """
     run = Path(run)
-    manifest = read_manifest(run) if (run / FILE_NAME).exists() else start_manifest(run, command=[], seed=0)
+    manifest = read_manifest(run)
     path, key = run / name, Path(name).as_posix()
     entry: dict[str, Any] = {"sha256": hashlib.sha256(content).hexdigest(), "bytes": len(content)}
     if key in manifest["files"] and path.is_file():
@@ -174,8 +196,7 @@ def _hashes(entry: dict[str, Any]) -> list[str]:
 
 def note(run: Path, **fields: Any) -> None:
     """Merge fields into the manifest; a mapping merges into a mapping of the same name."""
-    run = Path(run)
-    manifest = read_manifest(run) if (run / FILE_NAME).exists() else start_manifest(run, command=[], seed=0)
+    manifest = read_manifest(run)
     for name, value in fields.items():
         old = manifest.get(name)
         manifest[name] = {**old, **value} if isinstance(old, dict) and isinstance(value, dict) else value

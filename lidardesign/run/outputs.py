@@ -68,11 +68,11 @@ def _check_replaced(name: str, path: Path, inputs: Iterable[Path]) -> None:
     if any(read.is_file() and read.samefile(path) for read in inputs):
         raise ConfigError(f"{path} is an input, and would be overwritten", where=name, hint=ELSEWHERE)
     for folder in path.resolve().parents[:2]:
-        if (folder / MANIFEST).is_file() and path.resolve().relative_to(folder).as_posix() in _files_of(folder):
+        if (folder / MANIFEST).is_file() and path.resolve().relative_to(folder).as_posix() in files_of_run(folder):
             raise ConfigError(f"{path} is a file of the run {folder}", where=name, hint=ELSEWHERE)
 
 
-def _files_of(run: Path) -> set[str]:
+def files_of_run(run: Path) -> set[str]:
     """The names of the files of a run; of one with a damaged manifest only the usual ones."""
     with contextlib.suppress(OSError, ValueError, AttributeError, TypeError):
         return {*RUN_FILES, *parse_json((run / MANIFEST).read_bytes()).get("files", ())}
