@@ -6,7 +6,6 @@ import contextlib
 import json
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -15,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 from lidardesign.config import RunConfig, load_run_config, with_task_settings
 from lidardesign.errors import LidardesignError
 from lidardesign.registry import plugin_guard
-from lidardesign.run.clock import WAIT_S, phase
-from lidardesign.run.files import sha256_file
+from lidardesign.run.clock import phase
+from lidardesign.run.files import named, sha256_file
 from lidardesign.run.inputs import MESH
-from lidardesign.run.manifest import locked_run, read_manifest
+from lidardesign.run.manifest import read_manifest
 from lidardesign.scenes.scene import Scene
 from lidardesign.space import DesignSpace
 from lidardesign.task import FolderConfig, Metric, Split, Task, conditions_of, metric_of, scenes_of
@@ -32,7 +31,6 @@ DESIGN_FOLDER = "designs"
 CONFIGURATION, MANIFEST, SAMPLES = "config.yaml", "manifest.json", "samples.npz"
 # Key of the manifest for the task's input files, with their SHA-256.
 INPUTS = "inputs"
-MOST_NAMED = 6
 
 Notes = Callable[[str], None]
 
@@ -64,10 +62,6 @@ class RunFolder:
         """
         folder = Path(folder)
         return cls(folder, *load_run_config(folder), read_manifest(folder).get("created"))
-
-    def lock(self, wait_s: float = WAIT_S) -> AbstractContextManager[Any]:
-        """Hold its lock, if it is still the run that was opened; see `locked_run`."""
-        return locked_run(self.folder, self.created, wait_s)
 
     def design_path(self, name: str) -> Path:
         """Path of a design file of this run."""
@@ -151,11 +145,6 @@ class RunFolder:
             # entries of older versions have no phases
             if isinstance(seconds, dict) and all(isinstance(value, int | float) for value in seconds.values())
         }
-
-
-def named(names: Sequence[str]) -> str:
-    """The first of some names, and how many more there are."""
-    return ", ".join(names[:MOST_NAMED]) + (f" and {len(names) - MOST_NAMED} more" if names[MOST_NAMED:] else "")
 
 
 def input_paths(config: BaseModel) -> list[Path]:

@@ -16,12 +16,14 @@ from lidardesign.config import RunConfig, load_run_config, resolve, save_run_con
 from lidardesign.errors import BackgroundNote, ConfigError, DataError, ThresholdError, check_choice, check_number
 from lidardesign.registry import distribution_of, load_task, plugin_guard, task_names
 from lidardesign.run.clock import WAIT_S, Clock, outermost_clock, phase
-from lidardesign.run.files import exchange, is_held, is_temporary, remove, run_lock, writer
+from lidardesign.run.files import FILE_NAME as LOCK
+from lidardesign.run.files import exchange, is_held, is_temporary, named, remove, run_lock, writer
 from lidardesign.run.manifest import note, start_manifest
 from lidardesign.run.outputs import check_writable, files_of_run
 from lidardesign.run.yaml import leaves, load_yaml
 from lidardesign.run_folder import (
     CONFIGURATION,
+    DESIGN_FOLDER,
     INPUTS,
     MANIFEST,
     SAMPLES,
@@ -30,7 +32,6 @@ from lidardesign.run_folder import (
     input_hashes,
     input_paths,
     log_note,
-    named,
     settings_texts,
 )
 from lidardesign.task import FolderConfig, Task, notes_of
@@ -38,7 +39,6 @@ from lidardesign.task import FolderConfig, Task, notes_of
 if TYPE_CHECKING:
     from lidardesign.density.training.learn import LearnProgress, LearnResult
 
-LOCK = ".lock"
 # Endings of the folders beside a run that is replaced: of the new run, and of the old one for an instant.
 NEW, OLD = ".new", ".old"
 # A run has begun once it has its configuration, which is written last; snapshots are of no use without a checkpoint.
@@ -159,17 +159,16 @@ class LearnRequest:
             if options.resume:
                 notes("the run has nothing to resume from yet; it starts from the beginning")
             check_can_start(place)
-            settings = _with_inputs(resolve(plugin, **choices))
+            settings = resolve(plugin, **choices)
+            if isinstance(settings.task, FolderConfig):
+                inputs = {INPUTS: input_hashes(settings.task)}
+                settings = replace(settings, task=settings.task.model_copy(update=inputs))
         request = cls(plugin, folder, settings, options, begun, replaces)
         if replaces:
-            kept = list(map(str, kept_files(folder)))
-            designs = [
-                path.stem
-                for path in RunFolder(folder, plugin, settings).design_paths()
-                if str(path.relative_to(folder)) not in kept
-            ]
-            lost = f", with its designs ({', '.join(designs)})" if designs else ""
-            stays = f"; what is not of the run stays: {named(kept)}" if kept else ""
+            recorded, kept = map(Path, sorted(files_of_run(folder))), named(list(map(str, kept_files(folder))))
+            designs = ", ".join(path.stem for path in recorded if path.parent.name == DESIGN_FOLDER)
+            lost = f", with its designs ({designs})" if designs else ""
+            stays = f"; what is not of the run stays: {kept}" if kept else ""
             notes(f"once it is learned it replaces the run {folder}{lost}{stays}")
         for line in RunFolder(place, plugin, settings).input_notes() if begun else ():
             notes(line)
@@ -289,13 +288,12 @@ class LearnRequest:
     def resume_hint(self) -> str:
         """The last checkpoint and the command that resumes from it, for people."""
         checkpoints = sorted(path.name for path in self.place.glob(CHECKPOINTS))
-        if checkpoints:
-            rest = f"the last checkpoint is {self.place / checkpoints[-1]}"
-        else:
+        if not checkpoints:
             return "before the first checkpoint; nothing was kept"
         again = f"--out {quote(str(self.folder))} {'--overwrite ' if self.replaces else ''}--resume"
         for option, value in (("--tolerance", self.options.tolerance), ("--time-budget", self.options.time_budget_s)):
             again += "" if value is None else f" {option} {value:g}"
+        rest = f"the last checkpoint is {self.place / checkpoints[-1]}"
         return f"{rest}\n  continue with: lidardesign learn {self.task.name} {again}"
 
     @contextlib.contextmanager
@@ -390,9 +388,7 @@ def _holds_run(folder: Path) -> bool:
     if folder.is_dir() and is_held(folder.resolve()):
         raise ConfigError("is a mount point, or holds the working folder: it cannot be replaced", where=where)
     if aside.exists():
-        hint = "move or remove it"
-        if not folder.exists():
-            hint = f"the new run is finished: mv {quote(str(next_to(folder, NEW)))} {quote(str(folder))}"
+        hint = f"remove it; if {folder} is not there: mv {quote(str(next_to(folder, NEW)))} {quote(str(folder))}"
         raise ConfigError("is left over from a replacement that was killed", where=str(aside), hint=hint)
     if not folder.is_dir() or _was_killed_before_it_began(folder):
         return False
@@ -442,10 +438,9 @@ def put_in_place(folder: Path) -> None:
 
 def kept_files(run: Path) -> list[Path]:
     """Paths in a run's folder of what the run did not record, so that it outlasts the run."""
-    own = files_of_run(run)
-    paths = [path for path in run.rglob("*") if path.is_symlink() or not path.is_dir()]
-    within = sorted(path.relative_to(run) for path in paths if not is_temporary(path.name))
-    return [path for path in within if path.as_posix() not in own]
+    paths = [path for path in sorted(run.rglob("*")) if path.is_symlink() or not path.is_dir()]
+    own = {*(run / name for name in files_of_run(run))}
+    return [path.relative_to(run) for path in paths if path not in own and not is_temporary(path.name)]
 
 
 def _was_killed_before_it_began(run: Path) -> bool:
@@ -454,13 +449,6 @@ def _was_killed_before_it_began(run: Path) -> bool:
     return CONFIGURATION not in names and all(
         name in STARTED_FILES or name == LOCK or is_temporary(name) for name in names
     )
-
-
-def _with_inputs(settings: RunConfig) -> RunConfig:
-    """The configuration of a new run, with the hashes of the input files where its task records them."""
-    if not isinstance(settings.task, FolderConfig):
-        return settings
-    return replace(settings, task=settings.task.model_copy(update={INPUTS: input_hashes(settings.task)}))
 
 
 def _resumed_settings(plugin: Task, run: Path, choices: Mapping[str, Any]) -> tuple[Task, RunConfig]:

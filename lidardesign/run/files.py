@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import functools
+import glob
 import hashlib
 import json
 import os
@@ -20,7 +21,7 @@ import secrets
 import shutil
 import socket
 import sys
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from lidardesign.errors import ConfigError, DataError
@@ -71,7 +72,6 @@ def write_atomic(path: Path, content: bytes | str) -> None:
         DataError: The disk is full, the folder is read-only, or anything else the system reports.
         BrokenPipeError: The reader of a pipe ended.
     """
-    path = Path(path)
     if path.is_symlink() and (path.is_file() or not path.exists()):
         path = Path(os.path.realpath(path))  # a rename would replace the link
     # names of files may be no UTF-8; they are shown escaped then
@@ -84,7 +84,6 @@ def write_atomic(path: Path, content: bytes | str) -> None:
             _write_straight(path, payload)
         else:
             temporary = temporary_beside(path)
-            _remove_abandoned(temporary)
             try:
                 _write_new(temporary, payload)
                 os.replace(temporary, path)
@@ -141,19 +140,13 @@ def _unwritten(path: Path, error: OSError) -> DataError:
 
 
 def temporary_beside(path: Path) -> Path:
-    """A unique temporary path beside a file, named after its computer and process."""
-    name = os.fsdecode(os.fsencode(path.name)[:NAME_BYTES])
-    return path.with_name(f".{name}.{host_mark()}-{os.getpid()}.{secrets.token_hex(4)}{TEMPORARY_SUFFIX}")
+    """A unique temporary path beside a path, named after its computer and process.
 
-
-def _remove_abandoned(temporary: Path) -> None:
-    """Remove what is temporary of the same target and was left by processes of this computer that were killed."""
-    beginning = temporary.name.rsplit("-", 1)[0]
-    for name in os.listdir(temporary.parent):
-        found = _TEMPORARY.fullmatch(name) if name.startswith(beginning) else None
-        if found and is_gone(int(found["pid"])):
-            with contextlib.suppress(OSError):
-                remove(temporary.with_name(name))
+    What processes of this computer that were killed left of the same kind is removed.
+    """
+    beginning = f".{os.fsdecode(os.fsencode(path.name)[:NAME_BYTES])}.{host_mark()}-"
+    remove_strays(path.parent.glob(f"{glob.escape(beginning)}*{TEMPORARY_SUFFIX}"))
+    return path.with_name(f"{beginning}{os.getpid()}.{secrets.token_hex(4)}{TEMPORARY_SUFFIX}")
 
 
 def remove(path: Path) -> None:
@@ -161,8 +154,8 @@ def remove(path: Path) -> None:
     shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink(missing_ok=True)
 
 
-# Most names of other files in a note; the rest is counted.
-MOST_NAMED = 5
+# Most names in a note; the rest is counted.
+MOST_NAMED = 6
 # Of the system call renameat2: paths as they are, and both of them exchanged.
 _FROM_HERE, _EXCHANGE = -100, 2
 
@@ -178,37 +171,40 @@ def write_folder(path: Path, files: Mapping[str, bytes]) -> list[str]:
         files: Content by name; names of files in subfolders have forward slashes.
 
     Returns:
-        Notes on other files in it, as of an earlier export, which stay, and on a set that was unfinished.
+        A note if it holds other files, as of an earlier export; they stay.
 
     Raises:
         DataError: A file has that name, the folder cannot be written, or another process is writing it.
     """
-    place, others = Path(os.path.realpath(path)), list[str]()
+    place = Path(os.path.realpath(path))
     try:
-        if place.is_dir():
-            others = sorted({*os.listdir(place)} - {Path(name).parts[0] for name in files})
-        elif place.exists():
-            raise DataError(
-                "is a file, and this is a folder of files", where=str(path), hint="give the name of a folder"
-            )
-        if not (_can_be_exchanged(place, files) and _replaced(place, files)):
-            _fill(place, files)
+        entries = list(os.scandir(place)) if place.exists() else []
+        whole = not place.exists() or (
+            all(entry.name in files and entry.is_file(follow_symlinks=False) for entry in entries)
+            and os.access(place.parent, os.W_OK)
+            and not is_held(place)
+        )
+        folder = temporary_beside(place if whole else place / UNFINISHED)
+        try:
+            for name, content in files.items():
+                (folder / name).parent.mkdir(parents=True, exist_ok=True)
+                _write_new(folder / name, content)
+            if not (whole and _takes_place(folder, place)):
+                _move_files(folder, place, files)
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
     except OSError as error:
         raise _unwritten(path, error) from error
-    notes = ["a set of files that was left unfinished there is whole now"] if UNFINISHED in others else []
-    if others := [name for name in others if name[0] != "." and name != UNFINISHED]:
-        named = ", ".join(others[:MOST_NAMED]) + (", ..." if len(others) > MOST_NAMED else "")
-        notes.append(f"the folder also holds {len(others)} other files, which stay as they are: {named}")
-    return notes
+    tops = {UNFINISHED, *(Path(name).parts[0] for name in files)}
+    others = sorted(entry.name for entry in entries if entry.name not in tops and entry.name[0] != ".")
+    if not others:
+        return []
+    return [f"the folder also holds {len(others)} other files, which stay as they are: {named(others)}"]
 
 
-def _can_be_exchanged(place: Path, names: Collection[str]) -> bool:
-    """True for a folder that is not there, or has nothing but a set's own files and may be exchanged with another."""
-    return not place.exists() or (
-        all(entry.name in names and entry.is_file(follow_symlinks=False) for entry in os.scandir(place))
-        and os.access(place.parent, os.W_OK)
-        and not is_held(place)
-    )
+def named(names: Sequence[str]) -> str:
+    """The first of some names, and how many more there are."""
+    return ", ".join(names[:MOST_NAMED]) + (f" and {len(names) - MOST_NAMED} more" if names[MOST_NAMED:] else "")
 
 
 def is_held(folder: Path) -> bool:
@@ -216,36 +212,19 @@ def is_held(folder: Path) -> bool:
     return os.path.ismount(folder) or Path.cwd().is_relative_to(os.path.realpath(folder))
 
 
-@contextlib.contextmanager
-def _staged(beside: Path, files: Mapping[str, bytes]) -> Iterator[Path]:
-    """A temporary folder beside a path, with files; whatever is there at the end is removed."""
-    folder = temporary_beside(beside)
-    beside.parent.mkdir(parents=True, exist_ok=True)
-    _remove_abandoned(folder)
-    try:
-        for name, content in files.items():
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            _write_new(folder / name, content)
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-def _replaced(place: Path, files: Mapping[str, bytes]) -> bool:
-    """Put a new folder in place of one; False where only its files can be replaced."""
-    with _staged(place, files) as folder:
-        if not place.exists():
-            os.rename(folder, place)
-            return True
-        old, new = place.stat(), folder.stat()
-        # whose it is, and who may read it, stays
-        if (old.st_uid, old.st_gid, old.st_mode) != (new.st_uid, new.st_gid, new.st_mode):
-            return False
-        if not exchange(folder, place):
-            return False
-        for name in {*os.listdir(folder)} - {*files}:  # what came meanwhile
-            os.rename(folder / name, place / name)
+def _takes_place(folder: Path, place: Path) -> bool:
+    """Put a folder in place of one with some of its files; False where that has to stay."""
+    if not place.exists():
+        os.rename(folder, place)
         return True
+    names, old, new = {*os.listdir(folder)}, place.stat(), folder.stat()
+    # whose it is, and who may read it, stays
+    alike = (old.st_uid, old.st_gid, old.st_mode) == (new.st_uid, new.st_gid, new.st_mode)
+    if not (alike and exchange(folder, place)):
+        return False
+    for name in {*os.listdir(folder)} - names:  # it came meanwhile
+        os.rename(folder / name, place / name)
+    return True
 
 
 def exchange(one: Path, other: Path) -> bool:
@@ -254,19 +233,16 @@ def exchange(one: Path, other: Path) -> bool:
     return call is not None and not call(_FROM_HERE, os.fsencode(one), _FROM_HERE, os.fsencode(other), _EXCHANGE)
 
 
-def _fill(place: Path, files: Mapping[str, bytes]) -> None:
-    """Replace the files of a set in a folder; a file that lists them is there, and locked, until all of them are."""
+def _move_files(folder: Path, place: Path, names: Collection[str]) -> None:
+    """Move files from one folder to another; a file that lists them is there, and locked, until all of them are."""
     from filelock import FileLock
 
     marker = place / UNFINISHED
-    for name in files:
-        (place / name).parent.mkdir(parents=True, exist_ok=True)
-        if (place / name).is_dir():
-            raise DataError("is a folder", where=str(place / name), hint="move it, or give another place")
-    with _staged(marker, files) as folder, FileLock(marker, timeout=WAIT_S):
-        left = [name for name in unfinished_names(place) if name not in files]
-        marker.write_text("\n".join([*files, *left]), encoding="utf-8")
-        for name in files:
+    with FileLock(marker, timeout=WAIT_S):
+        left = [name for name in unfinished_names(place) if name not in names]
+        marker.write_text("\n".join([*names, *left]), encoding="utf-8")
+        for name in names:
+            (place / name).parent.mkdir(parents=True, exist_ok=True)
             os.replace(folder / name, os.path.realpath(place / name))
         # removed while locked, so that a process that opened it meanwhile finds it gone
         marker.write_text("\n".join(left), encoding="utf-8") if left else marker.unlink()
@@ -277,20 +253,16 @@ def is_temporary(name: str) -> bool:
     return _TEMPORARY.fullmatch(name) is not None
 
 
-def remove_stray_temporaries(folder: Path) -> list[Path]:
-    """Remove what killed processes left temporarily in a folder and its subfolders; returns what was removed.
+def remove_strays(paths: Iterable[Path]) -> None:
+    """Remove what is temporary among some paths, unless it is of a process of this computer that still runs.
 
-    Call it only while no other computer writes there (the run's lock is held).
+    That of other computers is removed too: where they may be at work, leave it out.
     """
-    removed = []
-    for stray in sorted([*Path(folder).glob(f".*{TEMPORARY_SUFFIX}"), *Path(folder).glob(f"*/.*{TEMPORARY_SUFFIX}")]):
-        found = _TEMPORARY.fullmatch(stray.name)
-        at_work = found and found["host"] == host_mark() and not is_gone(int(found["pid"]))
-        if found and not at_work:
+    for path in paths:
+        found = _TEMPORARY.fullmatch(path.name)
+        if found and (found["host"] != host_mark() or is_gone(int(found["pid"]))):
             with contextlib.suppress(OSError):
-                remove(stray)
-                removed.append(stray)
-    return removed
+                remove(path)
 
 
 def sha256_file(path: Path) -> str:
@@ -333,13 +305,11 @@ def run_lock(run: Path, *, wait_s: float = 0.0) -> Iterator[None]:
 
     Raises:
         ConfigError: Another process writes this run.
-        DataError: The folder is gone, or cannot be written.
+        DataError: The folder cannot be written.
     """
     from filelock import FileLock, Timeout
 
     path = Path(run) / FILE_NAME
-    if not path.parent.is_dir():  # the lock would make it
-        raise DataError("no such run", where=str(run))
     check_lock(run)
     lock = FileLock(path)
     try:
@@ -355,7 +325,7 @@ def run_lock(run: Path, *, wait_s: float = 0.0) -> Iterator[None]:
     try:
         with contextlib.suppress(OSError):  # a lock without a name holds as well
             path.write_text(json.dumps({"pid": os.getpid(), "host": socket.gethostname()}), encoding="utf-8")
-        remove_stray_temporaries(Path(run))
+        remove_strays([*path.parent.glob(f".*{TEMPORARY_SUFFIX}"), *path.parent.glob(f"*/.*{TEMPORARY_SUFFIX}")])
         yield
     finally:
         # removed while held, so that a process that opened it meanwhile finds it gone

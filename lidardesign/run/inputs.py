@@ -80,8 +80,11 @@ def check_file(path: Path | str, kind: Kind, *, allowed: str | None = None, hint
         raise kind.error("is not a regular file", where=str(path), allowed=allowed, hint=hint or FILE_HINT)
     check_bytes(status.st_size, kind, str(path))
     if os.path.basename(path) in unfinished_names(Path(path).parent):
-        hint = f"write them again; {UNFINISHED} beside it names them all"
-        raise kind.error("is one of a set of files of which only some were replaced", where=str(path), hint=hint)
+        raise kind.error(
+            f"is of a set that is unfinished: only some of the files in {UNFINISHED} were replaced",
+            where=str(path),
+            hint="write them again",
+        )
     return status.st_size
 
 
@@ -109,14 +112,7 @@ def read_file(path: Path | str, kind: Kind, *, allowed: str | None = None, hint:
     Raises:
         DataError, ConfigError: As of `check_file`, or it cannot be read.
     """
-    check_file(path, kind, allowed=allowed, hint=hint)
-    try:
-        with open(path, "rb") as file:
-            content = file.read(kind.most_bytes + 1)
-    except OSError as error:
-        raise kind.error(
-            f"cannot be read: {error.strerror or error}", where=str(path), allowed=allowed, hint=hint
-        ) from None
+    content = _read(path, kind, kind.most_bytes + 1, allowed, hint)
     check_bytes(len(content), kind, str(path))
     return content
 
@@ -127,12 +123,18 @@ def read_head(path: Path | str, kind: Kind, *, hint: str | None = None) -> bytes
     Raises:
         DataError, ConfigError: As of `read_file`.
     """
-    check_file(path, kind, hint=hint)
+    return _read(path, kind, HEAD_BYTES, None, hint)
+
+
+def _read(path: Path | str, kind: Kind, most_bytes: int, allowed: str | None, hint: str | None) -> bytes:
+    check_file(path, kind, allowed=allowed, hint=hint)
     try:
         with open(path, "rb") as file:
-            return file.read(HEAD_BYTES)
+            return file.read(most_bytes)
     except OSError as error:
-        raise kind.error(f"cannot be read: {error.strerror or error}", where=str(path), hint=hint) from None
+        raise kind.error(
+            f"cannot be read: {error.strerror or error}", where=str(path), allowed=allowed, hint=hint
+        ) from None
 
 
 def parse_json(content: bytes | str) -> Any:

@@ -6,7 +6,7 @@ import contextlib
 import hashlib
 import json
 import platform
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -40,7 +40,7 @@ def versions() -> dict[str, str]:
     return found
 
 
-def start_manifest(run: Path, *, command: list[str], seed: int) -> dict[str, Any]:
+def start_manifest(run: Path, *, command: list[str], seed: int) -> None:
     """Write the manifest of a new run: versions, command and time; no files yet."""
     manifest = {
         "schema_version": SCHEMA_VERSION,
@@ -52,7 +52,6 @@ def start_manifest(run: Path, *, command: list[str], seed: int) -> dict[str, Any
         "files": {},
     }
     write_manifest(run, manifest)
-    return manifest
 
 
 def read_manifest(run: Path) -> dict[str, Any]:
@@ -61,7 +60,6 @@ def read_manifest(run: Path) -> dict[str, Any]:
     Raises:
         DataError: There is no such run, or its manifest is damaged or of a newer version.
     """
-    run = Path(run)
     path = run / FILE_NAME
     if not run.exists():
         raise DataError("no such run", where=str(run), hint=LEARN_HINT)
@@ -114,6 +112,7 @@ def locked_run(run: Path, created: str | None = None, wait_s: float = WAIT_S) ->
         ConfigError: Another process writes this run.
         DataError: It is gone, another run is in its folder, or it cannot be written.
     """
+    read_manifest(run)  # the lock would make the folder
     with run_lock(run, wait_s=wait_s):
         manifest = read_manifest(run)
         if created not in (None, manifest.get("created")):
@@ -123,12 +122,11 @@ def locked_run(run: Path, created: str | None = None, wait_s: float = WAIT_S) ->
 
 def write_manifest(run: Path, manifest: dict[str, Any]) -> None:
     """Replace the manifest of a run, atomically."""
-    write_atomic(Path(run) / FILE_NAME, json.dumps(manifest, indent=2) + "\n")
+    write_atomic(run / FILE_NAME, json.dumps(manifest, indent=2) + "\n")
 
 
 def record(run: Path, names: Iterable[str]) -> None:
     """Enter the present size and SHA-256 of files of a run (names relative to it, with forward slashes)."""
-    run = Path(run)
     manifest = read_manifest(run)
     for name in names:
         path = run / name
@@ -136,9 +134,8 @@ def record(run: Path, names: Iterable[str]) -> None:
     write_manifest(run, manifest)
 
 
-def forget(run: Path, names: Iterable[str]) -> None:
+def forget(run: Path, names: Collection[str]) -> None:
     """Remove files of a run and then their entries; missing files lose only their entry."""
-    run, names = Path(run), list(names)
     if not names:
         return
     for name in names:
@@ -154,7 +151,6 @@ def announce(run: Path, name: str, content: bytes) -> None:
 
     A process that is killed between the two writes then leaves a file that still verifies.
     """
-    run = Path(run)
     manifest = read_manifest(run)
     path, key = run / name, Path(name).as_posix()
     entry: dict[str, Any] = {"sha256": hashlib.sha256(content).hexdigest(), "bytes": len(content)}
@@ -169,7 +165,7 @@ def announce(run: Path, name: str, content: bytes) -> None:
 def write_recorded(run: Path, name: str, content: bytes) -> None:
     """Write a file of a run atomically, with its hash in the manifest at every moment."""
     announce(run, name, content)
-    write_atomic(Path(run) / name, content)
+    write_atomic(run / name, content)
     record(run, [name])
 
 
@@ -179,7 +175,6 @@ def changed_since_recorded(run: Path, name: str) -> str | None:
     Raises:
         DataError: The manifest or the file cannot be read.
     """
-    run = Path(run)
     entry = read_manifest(run)["files"].get(Path(name).as_posix())
     if entry is None or sha256_file(run / name) in _hashes(entry):
         return None
@@ -209,7 +204,6 @@ def verify(run: Path, name: str) -> None:
     Raises:
         DataError: No such run; the file was never recorded; it is missing, truncated or changed.
     """
-    run = Path(run)
     path = run / name
     entry = read_manifest(run)["files"].get(Path(name).as_posix())
     if entry is None and path.exists():

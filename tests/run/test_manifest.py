@@ -17,7 +17,7 @@ import pytest
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.run import files
 from lidardesign.run import manifest as manifest_module
-from lidardesign.run.files import remove_stray_temporaries, run_lock, write_atomic
+from lidardesign.run.files import run_lock, write_atomic
 from lidardesign.run.manifest import (
     announce,
     note,
@@ -108,14 +108,16 @@ def test_the_next_writer_of_a_file_removes_what_a_killed_one_left(tmp_path, name
 
 def test_the_run_s_next_writer_cleans_its_folders_but_not_what_is_at_work_or_not_ours(tmp_path):
     (tmp_path / "designs").mkdir()
+    left = tmp_path / f".mounts.{'0' * 8}-{GONE}.0.tmp" / "half"
+    left.mkdir(parents=True)
     at_work = files.temporary_beside(tmp_path / "designs" / "fit.yaml")
     abandoned = at_work.with_name(at_work.name.replace(f"-{os.getpid()}.", f"-{GONE}."))
     foreign = tmp_path / "designs" / ".notes.tmp"
     for path in (at_work, abandoned, foreign):
         path.write_bytes(b"half")
-    assert remove_stray_temporaries(tmp_path) == [abandoned]
-    assert at_work.exists()
-    assert foreign.exists()
+    with run_lock(tmp_path):
+        assert {*tmp_path.iterdir()} == {tmp_path / ".lock", tmp_path / "designs"}
+        assert {*(tmp_path / "designs").iterdir()} == {at_work, foreign}
 
 
 def test_a_recorded_file_verifies_and_the_manifest_says_what_made_it(run):

@@ -400,10 +400,6 @@ def written_file(path: Path, suffix: str = "") -> Iterator[Path]:
     with tempfile.TemporaryDirectory(prefix="lidardesign-") as folder:
         staged = Path(folder) / f"file{suffix}"
         yield staged
-        if staged.is_dir():
-            raise DataError(
-                "is not a folder, and this is a folder of files", where=str(path), hint="give a folder's name"
-            )
         write_atomic(path, staged.read_bytes())
 
 
