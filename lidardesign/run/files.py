@@ -184,7 +184,9 @@ def write_folder(path: Path, files: Mapping[str, bytes]) -> list[str]:
             and os.access(place.parent, os.W_OK)
             and not is_held(place)
         )
-        folder = temporary_beside(place if whole else place / UNFINISHED)
+        folder = temporary_beside(place)
+        if not whole:
+            folder = temporary_beside(place / UNFINISHED)
         try:
             for name, content in files.items():
                 (folder / name).parent.mkdir(parents=True, exist_ok=True)

@@ -15,7 +15,7 @@ from support.plugins import GOOD, install_plugins
 from lidardesign.cli.main import app
 from lidardesign.rays.pool import FILE_NAME as CACHE
 from lidardesign.run.files import run_lock
-from lidardesign.run.manifest import note, read_manifest, verify
+from lidardesign.run.manifest import note, read_manifest, record, verify
 
 TINY = ("steps=2", "batch=64", "samples=1000", "balance_proposals=256", "coverage_proposals=256", "hidden=4")
 SET_TINY = ("train=1", *(f"learning.{one}" for one in TINY))
@@ -57,16 +57,22 @@ def test_hints_can_be_pasted_whatever_a_folder_is_called(lidardesign, flat):
     assert pasted(result.err) == ["fit", str(flat)]
 
 
+OTHERS = ("rows.csv", "designs/drawn/by hand.yaml")
+
+
 def learned(lidardesign, *arguments):
     return lidardesign("learn", "flatland", *set_options(SET_TINY, arguments), "--out", "run", *arguments)
 
 
 @pytest.fixture
 def old(lidardesign, tmp_path):
-    """The files of a run that was learned with the seed 0, and has a design."""
+    """The files of a run that was learned with the seed 0, and has a design; and others that the run did not write."""
     assert learned(lidardesign).code == 0
-    (tmp_path / "run" / "designs").mkdir()
+    (tmp_path / "run" / "designs" / "drawn").mkdir(parents=True)
     (tmp_path / "run" / "designs" / "mine.yaml").write_text("name: mine\n")
+    record(tmp_path / "run", ["designs/mine.yaml"])
+    for name in OTHERS:
+        (tmp_path / "run" / name).write_text(name)
     return files_under(tmp_path)
 
 
@@ -80,9 +86,12 @@ def test_a_run_is_replaced_only_where_that_is_asked_for(lidardesign, old, tmp_pa
 def test_a_replaced_run_is_the_one_that_another_folder_would_have_got(lidardesign, old, tmp_path):
     result = learned(lidardesign, "--seed", 1, "--overwrite", "--json")
     assert (result.code, result.json["run"]) == (0, "run")
-    assert "note: once it is learned it replaces the run run, with its designs (mine)" in result.err
+    assert "note: once it is learned it replaces the run run, with its designs (mine); what is not of the run " in (
+        result.err
+    )
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
-    assert not (tmp_path / "run" / "designs").exists()
+    assert not (tmp_path / "run" / "designs" / "mine.yaml").exists()
+    assert [(tmp_path / "run" / name).read_text() for name in OTHERS] == [*OTHERS]
     assert read_manifest(tmp_path / "run")["learn"]["run"] == "run"
     verify(tmp_path / "run", "samples.npz")
     lidardesign("learn", "flatland", *LEARN_TINY, "--out", "other", "--seed", 1)
@@ -91,7 +100,7 @@ def test_a_replaced_run_is_the_one_that_another_folder_would_have_got(lidardesig
 
 
 def test_what_would_be_replaced_is_said_before(lidardesign, old, tmp_path):
-    assert "replaces the run run, with its designs (mine)" in learned(lidardesign, "--overwrite", "--dry-run").err
+    assert "not of the run stays: designs/drawn/by hand.yaml, rows.csv" in learned(lidardesign, "--overwrite", "--dry-run").err
     assert files_under(tmp_path) == old
 
 
@@ -129,6 +138,7 @@ def test_both_runs_are_kept_where_a_folder_cannot_be_renamed(lidardesign, old, t
 
     with monkeypatch.context() as patch:
         patch.setattr(Path, "rename", refuse)
+        patch.setattr("lidardesign.api.learn.exchange", lambda *_: False)
         result = learned(lidardesign, "--seed", 1, "--overwrite")
     assert result.code == 3
     assert "run.new: cannot replace run: Permission denied" in result.err
