@@ -242,8 +242,8 @@ class LearnRequest:
         result = self._learned(clock, progress, remark)
         if not self.replaces:
             return result
+        note(self.place, learn={"run": str(self.folder)})
         put_in_place(self.folder)
-        note(self.folder, learn={"run": str(self.folder)})
         return replace(result, run=str(self.folder))
 
     def _learned(
