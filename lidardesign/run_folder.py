@@ -130,11 +130,6 @@ class RunFolder:
         """Paths of this run's design files, sorted by name."""
         return sorted((self.folder / DESIGN_FOLDER).glob("*.yaml"))
 
-    @property
-    def has_samples(self) -> bool:
-        """True if the run has samples of the density."""
-        return (self.folder / SAMPLES).exists()
-
     def command_times(self) -> dict[str, dict[str, float]]:
         """Seconds by phase of each command on this run, in the order in which they first ran."""
         entries = read_manifest(self.folder).get("timings", {})

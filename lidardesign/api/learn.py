@@ -16,10 +16,9 @@ from lidardesign.config import RunConfig, load_run_config, resolve, save_run_con
 from lidardesign.errors import BackgroundNote, ConfigError, DataError, ThresholdError, check_choice, check_number
 from lidardesign.registry import distribution_of, load_task, plugin_guard, task_names
 from lidardesign.run.clock import WAIT_S, Clock, outermost_clock, phase
-from lidardesign.run.files import FILE_NAME as LOCK
 from lidardesign.run.files import exchange, is_held, is_temporary, named, remove, run_lock, writer
 from lidardesign.run.manifest import note, start_manifest
-from lidardesign.run.outputs import check_writable, files_of_run
+from lidardesign.run.outputs import LOCK, check_writable, files_of_run
 from lidardesign.run.yaml import leaves, load_yaml
 from lidardesign.run_folder import (
     CONFIGURATION,
@@ -293,8 +292,8 @@ class LearnRequest:
         again = f"--out {quote(str(self.folder))} {'--overwrite ' if self.replaces else ''}--resume"
         for option, value in (("--tolerance", self.options.tolerance), ("--time-budget", self.options.time_budget_s)):
             again += "" if value is None else f" {option} {value:g}"
-        rest = f"the last checkpoint is {self.place / checkpoints[-1]}"
-        return f"{rest}\n  continue with: lidardesign learn {self.task.name} {again}"
+        last = f"the last checkpoint is {self.place / checkpoints[-1]}"
+        return f"{last}\n  continue with: lidardesign learn {self.task.name} {again}"
 
     @contextlib.contextmanager
     def _undone_on_failure(self) -> Iterator[None]:
@@ -386,7 +385,11 @@ def _holds_run(folder: Path) -> bool:
     """
     where, aside = f"--out {folder}", next_to(folder, OLD)
     if folder.is_dir() and is_held(folder.resolve()):
-        raise ConfigError("is a mount point, or holds the working folder: it cannot be replaced", where=where)
+        raise ConfigError(
+            "is a mount point, or holds the working folder: it cannot be replaced",
+            where=where,
+            hint="give another --out",
+        )
     if aside.exists():
         hint = f"remove it; if {folder} is not there: mv {quote(str(next_to(folder, NEW)))} {quote(str(folder))}"
         raise ConfigError("is left over from a replacement that was killed", where=str(aside), hint=hint)

@@ -199,9 +199,8 @@ def write_folder(path: Path, files: Mapping[str, bytes]) -> list[str]:
         raise _unwritten(path, error) from error
     tops = {UNFINISHED, *(Path(name).parts[0] for name in files)}
     others = sorted(entry.name for entry in entries if entry.name not in tops and entry.name[0] != ".")
-    if not others:
-        return []
-    return [f"the folder also holds {len(others)} other files, which stay as they are: {named(others)}"]
+    note = f"the folder also holds {len(others)} other files, which stay as they are: {named(others)}"
+    return [note] if others else []
 
 
 def named(names: Sequence[str]) -> str:

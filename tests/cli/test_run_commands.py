@@ -100,7 +100,8 @@ def test_a_replaced_run_is_the_one_that_another_folder_would_have_got(lidardesig
 
 
 def test_what_would_be_replaced_is_said_before(lidardesign, old, tmp_path):
-    assert "not of the run stays: designs/drawn/by hand.yaml, rows.csv" in learned(lidardesign, "--overwrite", "--dry-run").err
+    said = learned(lidardesign, "--overwrite", "--dry-run").err
+    assert "with its designs (mine); what is not of the run stays: designs/drawn/by hand.yaml, rows.csv" in said
     assert files_under(tmp_path) == old
 
 
