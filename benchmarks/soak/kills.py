@@ -180,7 +180,7 @@ def set_killed(name: str, number: int, place: Path) -> tuple[bool, str, list[str
     if (again := Fork(SETS[name], here).ended()).code and (state, old) != ("new", {}):
         faults.append(f"given again it ended with {again.code}: {again.said[-300:]}")
     faults += ["given again it is not the new one"] if {**old, **found[1]} != {**old, **files_of(place / "set")} else []
-    faults += [f"given again it left {path.name}" for path in place.rglob(".*.tmp")]
+    faults += [f"given again it left {path.name}" for path in place.rglob(".*.tmp") if not again.code]
     return ended.code not in FINISHED, f"{told}: {state}", faults
 
 

@@ -164,7 +164,7 @@ class LearnRequest:
                 settings = replace(settings, task=settings.task.model_copy(update=inputs))
         request = cls(plugin, folder, settings, options, begun, replaces)
         if replaces:
-            recorded, kept = map(Path, sorted(files_of_run(folder))), named(list(map(str, kept_files(folder))))
+            recorded, kept = map(Path, sorted(files_of_run(folder))), named(list(map(str, unrecorded_files(folder))))
             designs = ", ".join(path.stem for path in recorded if path.parent.name == DESIGN_FOLDER)
             lost = f", with its designs ({designs})" if designs else ""
             stays = f"; what is not of the run stays: {kept}" if kept else ""
@@ -419,7 +419,7 @@ def put_in_place(folder: Path) -> None:
     place, new, aside = (next_to(folder, suffix) for suffix in ("", NEW, OLD))
     try:
         with run_lock(place, wait_s=WAIT_S):
-            for path in kept_files(place):
+            for path in unrecorded_files(place):
                 (new / path).parent.mkdir(parents=True, exist_ok=True)
                 os.link(place / path, new / path, follow_symlinks=False)
             if exchange(new, place):
@@ -439,7 +439,7 @@ def put_in_place(folder: Path) -> None:
     shutil.rmtree(aside, ignore_errors=True)
 
 
-def kept_files(run: Path) -> list[Path]:
+def unrecorded_files(run: Path) -> list[Path]:
     """Paths in a run's folder of what the run did not record, so that it outlasts the run."""
     paths = [path for path in sorted(run.rglob("*")) if path.is_symlink() or not path.is_dir()]
     own = {*(run / name for name in files_of_run(run))}

@@ -239,6 +239,8 @@ def _move_files(folder: Path, place: Path, names: Collection[str]) -> None:
     from filelock import FileLock
 
     marker = place / UNFINISHED
+    if in_the_way := [name for name in names if (place / name).is_dir()]:
+        raise DataError(f"{named(in_the_way)}: is a folder", where=str(place), hint="move it, or give another place")
     with FileLock(marker, timeout=WAIT_S):
         left = [name for name in unfinished_names(place) if name not in names]
         marker.write_text("\n".join([*names, *left]), encoding="utf-8")

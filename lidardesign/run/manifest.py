@@ -6,7 +6,7 @@ import contextlib
 import hashlib
 import json
 import platform
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -14,7 +14,7 @@ from typing import Any
 
 from lidardesign import __version__
 from lidardesign.errors import DataError
-from lidardesign.run.clock import WAIT_S
+from lidardesign.run.clock import WAIT_S, Clock, peak_memory_bytes
 from lidardesign.run.files import run_lock, sha256_file, write_atomic, writer
 from lidardesign.run.inputs import RECORD, parse_json, read_file
 
@@ -223,3 +223,37 @@ def verify(run: Path, name: str) -> None:
     difference = changed_since_recorded(run, name)
     if difference is not None:
         raise DataError(difference, where=str(path), hint="restore it or learn the run again")
+
+
+def keep_timings(
+    run: Path,
+    command: str,
+    clock: Clock,
+    *,
+    wait_s: float = WAIT_S,
+    created: str | None = None,
+    further: Mapping[str, Any] | None = None,
+) -> None:
+    """Enter a command's times in a run's manifest, in place of those of the last time, under the run's lock.
+
+    Arguments:
+        run: The run folder.
+        command: Its name.
+        clock: Its clock.
+        wait_s: Time to wait for another writer [s].
+        created: When the run was made that must be in it; None: any.
+        further: Mappings of the manifest that get further entries, by name.
+
+    Raises:
+        ConfigError, DataError: The run is being written, or cannot be.
+    """
+    entry: dict[str, Any] = {
+        "when": datetime.now(UTC).isoformat(timespec="seconds"),
+        "seconds": round(clock.seconds, 3),
+        "peak_memory_bytes": peak_memory_bytes(),
+        "phases": clock.timings(),
+    }
+    with locked_run(run, created, wait_s) as manifest:
+        commands = {name: times for name, times in manifest.get("timings", {}).items() if isinstance(times, dict)}
+        merged = {name: {**(manifest.get(name) or {}), **entries} for name, entries in (further or {}).items()}
+        write_manifest(run, {**manifest, "timings": {**commands, command: entry}, **merged})

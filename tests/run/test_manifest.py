@@ -234,6 +234,16 @@ def test_a_set_that_is_unfinished_stays_named_until_its_own_files_are_whole(tmp_
     assert read_file(tmp_path / "a", RECORD) == NEW["a"]
 
 
+def test_a_folder_in_the_way_of_a_file_is_named_and_nothing_is_replaced(tmp_path):
+    write_folder(tmp_path / "set", OLD)
+    (tmp_path / "set" / "b").unlink()
+    (tmp_path / "set" / "b").mkdir()
+    with pytest.raises(DataError, match="b: is a folder"):
+        write_folder(tmp_path / "set", NEW)
+    assert {path.name for path in (tmp_path / "set").iterdir()} == {*OLD}
+    assert (tmp_path / "set" / "a").read_bytes() == OLD["a"]
+
+
 def test_two_writers_of_one_folder_do_not_mix(tmp_path):
     for kind in ("old", "among others"):
         with pytest.MonkeyPatch.context() as patch:

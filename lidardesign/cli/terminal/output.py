@@ -25,8 +25,9 @@ import typer
 from lidardesign.cli.terminal.grids import ProgressDisplay, duration
 from lidardesign.cli.terminal.score_tables import show_times
 from lidardesign.errors import BackgroundNote, ConfigError, DataError, LidardesignError, NumericalError, lacks_memory
-from lidardesign.run.clock import Clock, keep_timings, peak_memory_bytes, running
+from lidardesign.run.clock import Clock, peak_memory_bytes, running
 from lidardesign.run.files import write_atomic
+from lidardesign.run.manifest import keep_timings
 from lidardesign.run.outputs import check_outputs
 
 if TYPE_CHECKING:
