@@ -419,7 +419,8 @@ def put_in_place(folder: Path) -> None:
     place, new, aside = (next_to(folder, suffix) for suffix in ("", NEW, OLD))
     try:
         with run_lock(place, wait_s=WAIT_S):
-            for path in unrecorded_files(place):
+            # some may be there already, from a try that was killed
+            for path in (one for one in unrecorded_files(place) if not os.path.lexists(new / one)):
                 (new / path).parent.mkdir(parents=True, exist_ok=True)
                 os.link(place / path, new / path, follow_symlinks=False)
             if exchange(new, place):
