@@ -27,7 +27,7 @@ from lidardesign.fitting.options import FitOptions
 from lidardesign.fitting.request import FitRequest, FitResult
 from lidardesign.formats.designs import need_run, reach_beside, read_design, relative_folder, run_of
 from lidardesign.rays.information import FEW_SCENES
-from lidardesign.run.clock import Progress, phase
+from lidardesign.run.clock import WAIT_S, Progress, phase
 from lidardesign.run.manifest import locked_run, write_recorded
 from lidardesign.run_folder import Notes, RunFolder, ignore, log_note, settings_texts
 from lidardesign.scenes.rays import Rays
@@ -220,7 +220,7 @@ class Design(DesignSource):
             self.path = run.design_path(self.name)
             content = design_text(self.specification, self.path).encode()
             # several designs may be fitted to one run at once; each holds the lock for an instant
-            with locked_run(run.folder, run.created):
+            with locked_run(run.folder, run.created, WAIT_S):
                 write_recorded(run.folder, self.path.relative_to(run.folder).as_posix(), content)
             return self.path
         path, origin = Path(path), dict(self.specification.provenance)

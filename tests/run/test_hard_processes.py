@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import functools
 import json
 import os
 import shutil
@@ -21,7 +20,7 @@ from support.command_line import files_under, make_run, program, set_options
 
 from lidardesign.run import files as lock
 from lidardesign.run.files import run_lock
-from lidardesign.run.manifest import locked_run, start_manifest
+from lidardesign.run.manifest import start_manifest
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="faults of processes are made with POSIX calls")
 # The least that can be learned.
@@ -64,7 +63,7 @@ class TestKillsFullDisksAndTwoWriters:
         assert files_under(run) == before
 
     def test_a_second_writer_is_told_who_writes_and_changes_nothing(self, tmp_path, lidardesign, monkeypatch):
-        monkeypatch.setattr("lidardesign.api.design.locked_run", functools.partial(locked_run, wait_s=0.05))
+        monkeypatch.setattr("lidardesign.api.design.WAIT_S", 0.05)
         run = make_run(tmp_path / "run", count=1000)
         before = files_under(run)
         with run_lock(run):
