@@ -15,7 +15,7 @@ from lidardesign.config import RunConfig, load_run_config, with_task_settings
 from lidardesign.errors import LidardesignError
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
-from lidardesign.run.files import sha256_file
+from lidardesign.run.files import named, sha256_file
 from lidardesign.run.inputs import MESH
 from lidardesign.run.manifest import read_manifest
 from lidardesign.scenes.scene import Scene
@@ -31,7 +31,6 @@ DESIGN_FOLDER = "designs"
 CONFIGURATION, MANIFEST, SAMPLES = "config.yaml", "manifest.json", "samples.npz"
 # Key of the manifest for the task's input files, with their SHA-256.
 INPUTS = "inputs"
-MOST_NAMED = 6
 
 Notes = Callable[[str], None]
 
@@ -47,11 +46,12 @@ def log_note(text: str) -> None:
 
 @dataclass(frozen=True)
 class RunFolder:
-    """An open run folder with its task and configuration."""
+    """An open run folder with its task and configuration, and when it was made; None: not to be compared."""
 
     folder: Path
     task: Task
     config: RunConfig
+    created: str | None = None
 
     @classmethod
     def open(cls, folder: Path | str) -> Self:
@@ -61,7 +61,7 @@ class RunFolder:
             DataError: There is none, or it is damaged.
         """
         folder = Path(folder)
-        return cls(folder, *load_run_config(folder))
+        return cls(folder, *load_run_config(folder), read_manifest(folder).get("created"))
 
     def design_path(self, name: str) -> Path:
         """Path of a design file of this run."""
@@ -114,8 +114,8 @@ class RunFolder:
         changed = [name for name, digest in moved.items() if digest not in renamed]
         notes = task.twin_notes() if isinstance(task, FolderConfig) else []
         if changed:
-            named = _named([f"{name} {'changed' if Path(name).exists() else 'is gone'}" for name in changed])
-            notes.append(f"{named} since {self.folder} was learned: its scenes are different now")
+            moves = named([f"{name} {'changed' if Path(name).exists() else 'is gone'}" for name in changed])
+            notes.append(f"{moves} since {self.folder} was learned: its scenes are different now")
         came = [
             Path(name).name
             for name, digest in now.items()
@@ -123,17 +123,12 @@ class RunFolder:
         ]
         if came:
             left_out = f"added after {self.folder} was learned, so left out; learn again to include what is new"
-            notes.append(f"{_named(came)}: {left_out}")
+            notes.append(f"{named(came)}: {left_out}")
         return notes
 
     def design_paths(self) -> list[Path]:
         """Paths of this run's design files, sorted by name."""
         return sorted((self.folder / DESIGN_FOLDER).glob("*.yaml"))
-
-    @property
-    def has_samples(self) -> bool:
-        """True if the run has samples of the density."""
-        return (self.folder / SAMPLES).exists()
 
     def command_times(self) -> dict[str, dict[str, float]]:
         """Seconds by phase of each command on this run, in the order in which they first ran."""
@@ -145,11 +140,6 @@ class RunFolder:
             # entries of older versions have no phases
             if isinstance(seconds, dict) and all(isinstance(value, int | float) for value in seconds.values())
         }
-
-
-def _named(names: Sequence[str]) -> str:
-    """The first of some names, and how many more there are."""
-    return ", ".join(names[:MOST_NAMED]) + (f" and {len(names) - MOST_NAMED} more" if names[MOST_NAMED:] else "")
 
 
 def input_paths(config: BaseModel) -> list[Path]:

@@ -1,10 +1,11 @@
-"""Kills of learn, fit and evaluate, `make soak-kills`: what is left can be read, and going on gives the same bytes.
+"""Kills of commands that write, `make soak-kills`: what is left can be read, and going on gives the same bytes.
 
 A fork is sent SIGKILL or SIGTERM before one of the steps by which files change, or after a random time. Then every
 file that is there must be readable, the command given again (`learn` with --resume) must end well and leave no lock and
 no temporary file, and the bytes of flow, samples, snapshots, checkpoint, designs and tables must be those of a run that
-nobody disturbed, but for the seconds in them. Of two commands at once in one folder one must work, and the other must
-work or be told why not.
+nobody disturbed, but for the seconds in them. A folder of several files must be the old or the new one, or name what is
+unfinished, and be the new one once the command is given again. Of two commands at once in one folder one must work, and
+the other must work or be told why not.
 """
 
 from __future__ import annotations
@@ -21,9 +22,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from trimesh.creation import box
 
-from benchmarks.soak.disturbed import COMMANDS, FINISHED, LEARN, Ended, Fork, Straight, contents, strays, unreadable
+from benchmarks.soak.disturbed import (
+    COMMANDS,
+    FINISHED,
+    LEARN,
+    Ended,
+    Fork,
+    Straight,
+    contents,
+    import_all,
+    strays,
+    unreadable,
+)
 from benchmarks.soak.long_runs import amount
+from lidardesign.run.inputs import UNFINISHED, unfinished_names
 
 # Commands that are given at once, in a folder as it was before one of them.
 GIVEN = {**{name: command.arguments for name, command in COMMANDS.items()}, "learn --resume": [*LEARN, "--resume"]}
@@ -35,6 +49,17 @@ PAIRS = {
         ("evaluate", "evaluate", "evaluate"), ("evaluate", "evaluate", "fit"),
     )
 }  # fmt: skip
+# Commands that write several files, over those of another design; the last ones in the folder where they are given.
+EXPORT = ["export", "../new.yaml", "--quiet", "--format"]
+SETS = {
+    **{f"{form}": [*EXPORT, form, "--out", "../set"] for form in ("mounts", "helios", "rgl", "mitsuba", "ply")},
+    "simulate": ["simulate", "../new.yaml", "--quiet", "--scene", "../box.stl", "--out", "../set"],
+    "tasks new": ["tasks", "new", "landmark", "--quiet", "--out", "../set"],
+    "mounts here": [*EXPORT, "mounts", "--out", "."],
+    "rgl here": [*EXPORT, "rgl", "--out", "."],
+    "tasks new here": ["tasks", "new", "landmark", "--quiet", "--out", "."],
+}
+PARTS = {"old": "vl53l8cx", "new": "tmf8828"}
 REFUSED = (2, 3)
 LONGEST_DELAY_S = 2.0
 TERMINATED = 143
@@ -44,6 +69,7 @@ WAYS = [(where, sent) for where in TURNS for sent in ("SIGKILL", "SIGTERM")]
 ROUND = [
     *((*way, name) for turn in range(10) for way in WAYS for name, turns in TURNS[way[0]].items() if turn < turns),
     *(("pair", "", name) for name in PAIRS),
+    *(("set", "SIGKILL", name) for name in SETS),
 ]
 
 
@@ -66,7 +92,9 @@ def straight(tmp_path_factory):
 @pytest.mark.filterwarnings("default")
 def test_what_is_disturbed_recovers(tmp_path, piece, straight, where, sent, name, number):
     def work():
-        if where == "pair":
+        if where == "set":
+            met, told, faults = set_killed(name, number, tmp_path)
+        elif where == "pair":
             met, told, faults = at_once(straight(), name, number, tmp_path / "both")
         else:
             met, told, faults = ended_early(straight(), where, sent, name, number, tmp_path / "killed")
@@ -122,6 +150,45 @@ def _again(straight: Straight, name: str, place: Path) -> Iterator[str]:
     expected, found = straight.after[name], contents(place / "run")
     yield from (f"{file} differs" for file in sorted({*expected, *found}) if expected.get(file) != found.get(file))
     shutil.rmtree(place)
+
+
+def set_killed(name: str, number: int, place: Path) -> tuple[bool, str, list[str]]:
+    """Kill a command that writes several files, at every second time at one of its steps, look, and give it again."""
+    import_all()
+    here = place / ("set" if name.endswith("here") else "elsewhere")
+    here.mkdir(exist_ok=True)
+    (place / "box.stl").write_bytes(box(extents=(0.2, 0.2, 0.2)).apply_translation((1, 0, 0)).export(file_type="stl"))
+    found, ends = [], []
+    for version, part in PARTS.items():
+        Fork(["catalog", "show", part, "--out", f"../{version}.yaml"], here).ended()
+        ends.append(Fork([word.replace("new.", f"{version}.") for word in SETS[name]], here).ended())
+        found.append(files_of(place / "set"))
+        shutil.rmtree(place / "set")
+        here.mkdir(exist_ok=True)
+    old = {} if name.startswith("tasks new") else found[0]
+    for file, content in old.items():
+        (place / "set" / file).parent.mkdir(parents=True, exist_ok=True)
+        (place / "set" / file).write_bytes(content)
+    draw = np.random.default_rng([zlib.crc32(name.encode()), number])
+    step, after_s = int(draw.integers(ends[1].steps)) + 1, draw.uniform(0, ends[1].seconds)
+    told = f"step {step}" if number % 2 else f"after {after_s:.3f} s"
+    ended = Fork(SETS[name], here, step).ended() if number % 2 else Fork(SETS[name], here).ended(after_s)
+    left = files_of(place / "set")
+    state = next((word for word, files in (("old", old), ("new", found[1])) if files == left), "mixed")
+    faults = [f"undisturbed: {end.said[-300:]}" for end in ends if end.code]
+    faults += ["mixed, without saying so"] if state == "mixed" and not unfinished_names(place / "set") else []
+    if (again := Fork(SETS[name], here).ended()).code and (state, old) != ("new", {}):
+        faults.append(f"given again it ended with {again.code}: {again.said[-300:]}")
+    faults += ["given again it is not the new one"] if {**old, **found[1]} != {**old, **files_of(place / "set")} else []
+    faults += [f"given again it left {path.name}" for path in place.rglob(".*.tmp") if not again.code]
+    return ended.code not in FINISHED, f"{told}: {state}", faults
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    """The content of all files in a folder but for those that are temporary or name what is unfinished."""
+    paths = [path for path in folder.rglob("*") if path.is_file() and path.name != UNFINISHED]
+    within = [path.relative_to(folder) for path in paths]
+    return {path.as_posix(): (folder / path).read_bytes() for path in within if ".tmp" not in path.parts[0]}
 
 
 def at_once(straight: Straight, name: str, number: int, place: Path) -> tuple[bool, str, list[str]]:

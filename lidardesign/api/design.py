@@ -28,8 +28,7 @@ from lidardesign.fitting.request import FitRequest, FitResult
 from lidardesign.formats.designs import need_run, reach_beside, read_design, relative_folder, run_of
 from lidardesign.rays.information import FEW_SCENES
 from lidardesign.run.clock import WAIT_S, Progress, phase
-from lidardesign.run.files import run_lock
-from lidardesign.run.manifest import write_recorded
+from lidardesign.run.manifest import locked_run, write_recorded
 from lidardesign.run_folder import Notes, RunFolder, ignore, log_note, settings_texts
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Scene
@@ -221,7 +220,7 @@ class Design(DesignSource):
             self.path = run.design_path(self.name)
             content = design_text(self.specification, self.path).encode()
             # several designs may be fitted to one run at once; each holds the lock for an instant
-            with run_lock(run.folder, wait_s=WAIT_S):
+            with locked_run(run.folder, run.created, WAIT_S):
                 write_recorded(run.folder, self.path.relative_to(run.folder).as_posix(), content)
             return self.path
         path, origin = Path(path), dict(self.specification.provenance)

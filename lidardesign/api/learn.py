@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -15,9 +16,9 @@ from lidardesign.config import RunConfig, load_run_config, resolve, save_run_con
 from lidardesign.errors import BackgroundNote, ConfigError, DataError, ThresholdError, check_choice, check_number
 from lidardesign.registry import distribution_of, load_task, plugin_guard, task_names
 from lidardesign.run.clock import WAIT_S, Clock, outermost_clock, phase
-from lidardesign.run.files import is_temporary, run_lock, writer
+from lidardesign.run.files import exchange, is_held, is_temporary, named, remove, run_lock, writer
 from lidardesign.run.manifest import note, start_manifest
-from lidardesign.run.outputs import check_writable
+from lidardesign.run.outputs import LOCK, check_writable, files_of_run
 from lidardesign.run.yaml import leaves, load_yaml
 from lidardesign.run_folder import (
     CONFIGURATION,
@@ -37,7 +38,6 @@ from lidardesign.task import FolderConfig, Task, notes_of
 if TYPE_CHECKING:
     from lidardesign.density.training.learn import LearnProgress, LearnResult
 
-LOCK = ".lock"
 # Endings of the folders beside a run that is replaced: of the new run, and of the old one for an instant.
 NEW, OLD = ".new", ".old"
 # A run has begun once it has its configuration, which is written last; snapshots are of no use without a checkpoint.
@@ -158,12 +158,17 @@ class LearnRequest:
             if options.resume:
                 notes("the run has nothing to resume from yet; it starts from the beginning")
             check_can_start(place)
-            settings = _with_inputs(resolve(plugin, **choices))
+            settings = resolve(plugin, **choices)
+            if isinstance(settings.task, FolderConfig):
+                inputs = {INPUTS: input_hashes(settings.task)}
+                settings = replace(settings, task=settings.task.model_copy(update=inputs))
         request = cls(plugin, folder, settings, options, begun, replaces)
         if replaces:
-            designs = ", ".join(sorted(path.stem for path in (folder / DESIGN_FOLDER).glob("*.yaml")))
+            recorded, kept = map(Path, sorted(files_of_run(folder))), named(list(map(str, unrecorded_files(folder))))
+            designs = ", ".join(path.stem for path in recorded if path.parent.name == DESIGN_FOLDER)
             lost = f", with its designs ({designs})" if designs else ""
-            notes(f"once it is learned it replaces the run {folder}{lost}")
+            stays = f"; what is not of the run stays: {kept}" if kept else ""
+            notes(f"once it is learned it replaces the run {folder}{lost}{stays}")
         for line in RunFolder(place, plugin, settings).input_notes() if begun else ():
             notes(line)
         if begun and not request.has_checkpoint:
@@ -236,8 +241,8 @@ class LearnRequest:
         result = self._learned(clock, progress, remark)
         if not self.replaces:
             return result
+        note(self.place, learn={"run": str(self.folder)})
         put_in_place(self.folder)
-        note(self.folder, learn={"run": str(self.folder)})
         return replace(result, run=str(self.folder))
 
     def _learned(
@@ -282,14 +287,13 @@ class LearnRequest:
     def resume_hint(self) -> str:
         """The last checkpoint and the command that resumes from it, for people."""
         checkpoints = sorted(path.name for path in self.place.glob(CHECKPOINTS))
-        if checkpoints:
-            rest = f"the last checkpoint is {self.place / checkpoints[-1]}"
-        else:
+        if not checkpoints:
             return "before the first checkpoint; nothing was kept"
         again = f"--out {quote(str(self.folder))} {'--overwrite ' if self.replaces else ''}--resume"
         for option, value in (("--tolerance", self.options.tolerance), ("--time-budget", self.options.time_budget_s)):
             again += "" if value is None else f" {option} {value:g}"
-        return f"{rest}\n  continue with: lidardesign learn {self.task.name} {again}"
+        last = f"the last checkpoint is {self.place / checkpoints[-1]}"
+        return f"{last}\n  continue with: lidardesign learn {self.task.name} {again}"
 
     @contextlib.contextmanager
     def _undone_on_failure(self) -> Iterator[None]:
@@ -297,14 +301,14 @@ class LearnRequest:
         try:
             yield
         except BaseException:
-            entries = [entry for entry in self.place.iterdir() if entry.name != LOCK]
+            entries = [entry for entry in self.place.glob("*") if entry.name != LOCK]
             nothing_learned = all(entry.name in STARTED_FILES or entry.stat().st_size == 0 for entry in entries)
             if not self.begun and nothing_learned:
                 with contextlib.suppress(OSError):
                     # without its configuration a run has not begun, whatever else is left of it
                     (self.place / CONFIGURATION).unlink(missing_ok=True)
                     for entry in entries:
-                        shutil.rmtree(entry) if entry.is_dir() else entry.unlink(missing_ok=True)
+                        remove(entry)
             raise
 
 
@@ -380,10 +384,14 @@ def _holds_run(folder: Path) -> bool:
         ConfigError: It holds something else, is being written, or an earlier replacement was killed halfway.
     """
     where, aside = f"--out {folder}", next_to(folder, OLD)
+    if folder.is_dir() and is_held(folder.resolve()):
+        raise ConfigError(
+            "is a mount point, or holds the working folder: it cannot be replaced",
+            where=where,
+            hint="give another --out",
+        )
     if aside.exists():
-        hint = "move or remove it"
-        if not folder.exists():
-            hint = f"the new run is finished: mv {quote(str(next_to(folder, NEW)))} {quote(str(folder))}"
+        hint = f"remove it; if {folder} is not there: mv {quote(str(next_to(folder, NEW)))} {quote(str(folder))}"
         raise ConfigError("is left over from a replacement that was killed", where=str(aside), hint=hint)
     if not folder.is_dir() or _was_killed_before_it_began(folder):
         return False
@@ -403,18 +411,27 @@ def next_to(folder: Path, suffix: str) -> Path:
 def put_in_place(folder: Path) -> None:
     """Move the run that was learned beside a folder into its place, then delete the old one.
 
+    What the old one did not record is in the new one too before it takes its place.
+
     Raises:
         DataError: Somebody is writing the old one, or the folders cannot be renamed; both are kept.
     """
     place, new, aside = (next_to(folder, suffix) for suffix in ("", NEW, OLD))
     try:
         with run_lock(place, wait_s=WAIT_S):
-            place.rename(aside)
-            try:
-                new.rename(place)
-            except OSError:
-                aside.rename(place)
-                raise
+            # some may be there already, from a try that was killed
+            for path in (one for one in unrecorded_files(place) if not os.path.lexists(new / one)):
+                (new / path).parent.mkdir(parents=True, exist_ok=True)
+                os.link(place / path, new / path, follow_symlinks=False)
+            if exchange(new, place):
+                new.rename(aside)
+            else:
+                place.rename(aside)
+                try:
+                    new.rename(place)
+                except OSError:
+                    aside.rename(place)
+                    raise
     except (ConfigError, OSError) as error:
         reason = error.message if isinstance(error, ConfigError) else error.strerror or error
         hint = "the new run is finished: use it where it is, or move it"
@@ -423,19 +440,19 @@ def put_in_place(folder: Path) -> None:
     shutil.rmtree(aside, ignore_errors=True)
 
 
+def unrecorded_files(run: Path) -> list[Path]:
+    """Paths in a run's folder of what the run did not record, so that it outlasts the run."""
+    paths = [path for path in sorted(run.rglob("*")) if path.is_symlink() or not path.is_dir()]
+    own = {*(run / name for name in files_of_run(run))}
+    return [path.relative_to(run) for path in paths if path not in own and not is_temporary(path.name)]
+
+
 def _was_killed_before_it_began(run: Path) -> bool:
     """True for a folder that is empty or holds only the files of a killed start."""
     names = {entry.name for entry in run.iterdir()}
     return CONFIGURATION not in names and all(
         name in STARTED_FILES or name == LOCK or is_temporary(name) for name in names
     )
-
-
-def _with_inputs(settings: RunConfig) -> RunConfig:
-    """The configuration of a new run, with the hashes of the input files where its task records them."""
-    if not isinstance(settings.task, FolderConfig):
-        return settings
-    return replace(settings, task=settings.task.model_copy(update={INPUTS: input_hashes(settings.task)}))
 
 
 def _resumed_settings(plugin: Task, run: Path, choices: Mapping[str, Any]) -> tuple[Task, RunConfig]:

@@ -18,7 +18,7 @@ from lidardesign.fitting.fit import twin_samples, twin_without_visibility
 from lidardesign.numerics import SLACK
 from lidardesign.rays.training_scenes import TrainingScenes
 from lidardesign.run.clock import Progress, outermost_clock, phase, running
-from lidardesign.run_folder import DESIGN_FOLDER, Notes, RunFolder, log_note, settings_texts
+from lidardesign.run_folder import DESIGN_FOLDER, SAMPLES, Notes, RunFolder, log_note, settings_texts
 from lidardesign.samples import load_samples
 from lidardesign.scoring.baselines.cma import CMA, DEFAULT_SECONDS, CmaSettings
 from lidardesign.scoring.baselines.simple import ALWAYS, BASELINES, NONE, check_baseline
@@ -470,6 +470,8 @@ def evaluation_request(
         without_visibility=None
         if not from_runs
         else partial(twin_without_visibility, from_runs[0], learned, samples=cache(partial(twin_samples, learned))),
-        density=cache(lambda: load_samples(learned.folder, learned.config.space) if learned.has_samples else None),
+        density=cache(
+            lambda: load_samples(learned.folder, learned.config.space) if (learned.folder / SAMPLES).exists() else None
+        ),
         training=TrainingScenes(run, seed),
     )

@@ -9,13 +9,12 @@ import numpy as np
 
 from lidardesign.clouds.ros import NANOSECONDS, cloud_message, mcap_content, transforms_message
 from lidardesign.clouds.seen import COLUMNS, SeenScene
-from lidardesign.errors import ConfigError
 from lidardesign.formats.meshes import FACES, ply_file
 from lidardesign.formats.mount_page import mounted_parts
 from lidardesign.formats.mounts import quaternion
-from lidardesign.formats.names import identifier, write_folder
+from lidardesign.formats.names import identifier
 from lidardesign.formats.robots import WORLD
-from lidardesign.run.files import write_atomic
+from lidardesign.run.files import write_atomic, write_folder
 from lidardesign.scenes.rays import DEFAULT_RATE_HZ, Outcome
 
 FORMATS = ("ply", "pcd", "mcap")
@@ -32,11 +31,9 @@ def write_clouds(seen: Sequence[SeenScene], path: Path, form: str) -> list[str]:
         form: ply, pcd or mcap.
 
     Raises:
-        ConfigError: Another format, or the library mcap is missing.
+        ConfigError: The library mcap is missing.
         DataError: It cannot be written.
     """
-    if form not in FORMATS:
-        raise ConfigError(f"unknown format {form!r}", where="--format", allowed=", ".join(FORMATS))
     if form == "mcap":
         write_atomic(path, _mcap(seen))
         name = seen[0].design.condition

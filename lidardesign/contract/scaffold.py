@@ -9,7 +9,8 @@ from pathlib import Path
 
 from lidardesign import __version__, registry
 from lidardesign.errors import ConfigError, DataError, page
-from lidardesign.run.files import write_atomic
+from lidardesign.run.files import is_temporary, write_folder
+from lidardesign.run.inputs import UNFINISHED, unfinished_names
 from lidardesign.task import API_VERSION
 
 NAME = re.compile(r"[a-z][a-z0-9]*(_[a-z0-9]+)*")
@@ -42,9 +43,13 @@ def new_task(name: str, folder: Path | None = None) -> list[Path]:
         ConfigError: The name cannot be one, or is taken.
         DataError: The folder holds something, or cannot be written.
     """
-    allowed = f"small letters, digits and single underscores, up to {LONGEST_NAME}, such as landmark or drone_landing"
     if not NAME.fullmatch(name) or len(name) > LONGEST_NAME:
-        raise ConfigError(f"{name!r} is not a name for a task", where="NAME", allowed=allowed)
+        raise ConfigError(
+            f"{name!r} is not a name for a task",
+            where="NAME",
+            allowed=f"small letters, digits and single underscores, up to {LONGEST_NAME}, such as landmark or "
+            "drone_landing",
+        )
     if name in registry.task_names():
         raise ConfigError(f"a task {name!r} is installed already", where="NAME", hint="choose another name")
     if find_spec(f"lidardesign_{name}") is not None:
@@ -58,18 +63,19 @@ def new_task(name: str, folder: Path | None = None) -> list[Path]:
         "api_version": str(API_VERSION),
     }
     folder = Path(tokens["package"]) if folder is None else folder
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    # what a killed one left is gone on with
+    held = [one.name for one in folder.glob("*") if not is_temporary(one.name) and one.name != UNFINISHED]
+    if (folder.exists() and not folder.is_dir()) or (held and not unfinished_names(folder)):
         raise DataError("already exists", where=str(folder), allowed="a new or an empty folder", hint="--out DIR")
-    templates = files("lidardesign.contract") / "template"
-    written = []
-    for target, template in FILES.items():
-        path = folder / _filled(target, tokens)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomic(path, _filled((templates / template).read_text(encoding="utf-8"), tokens).encode())
-        written.append(path)
-    versions = folder / "constraints.txt"
-    write_atomic(versions, page("constraints.txt").read_bytes())
-    return [*written, versions]
+    written = {
+        _filled(target, tokens): _filled(
+            (files(__package__) / "template" / template).read_text(encoding="utf-8"), tokens
+        ).encode()
+        for target, template in FILES.items()
+    }
+    written["constraints.txt"] = page("constraints.txt").read_bytes()
+    write_folder(folder, written)
+    return [folder / name for name in written]
 
 
 def _filled(text: str, tokens: dict[str, str]) -> str:

@@ -18,9 +18,9 @@ from pathlib import Path
 
 import numpy as np
 
-from lidardesign.formats.names import identifier, numbers, write_folder
+from lidardesign.formats.names import identifier, numbers
 from lidardesign.numerics import unit_vectors
-from lidardesign.run.files import write_atomic
+from lidardesign.run.files import write_atomic, write_folder
 from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.pattern import field_on_sphere

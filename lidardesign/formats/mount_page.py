@@ -17,12 +17,13 @@ from typing import Any
 import numpy as np
 
 from lidardesign.formats.mounts import quaternion
-from lidardesign.formats.names import distinct, document, element, identifier, write_folder
+from lidardesign.formats.names import distinct, document, element, identifier
 from lidardesign.formats.robots import WORLD, fixed_link
 from lidardesign.numerics import EPSILON
 from lidardesign.parts.catalogue import parts_of
 from lidardesign.parts.part import Part
 from lidardesign.run.arrays import csv_table
+from lidardesign.run.files import write_folder
 from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.sensor import Sensor, boresight_frame, boresight_of

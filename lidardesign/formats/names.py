@@ -6,11 +6,7 @@ import re
 import unicodedata
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
 from xml.etree.ElementTree import Element
-
-from lidardesign.errors import DataError
-from lidardesign.run.files import write_atomic
 
 # Longest identifier; topics and prim paths are built of several.
 LONGEST_NAME = 64
@@ -69,29 +65,6 @@ def renamed_note(names: Sequence[str], written: Sequence[str]) -> list[str]:
 def xml_text(text: str) -> str:
     """Text that XML can hold once it is escaped: characters that it cannot become U+FFFD."""
     return _NOT_XML.sub("\ufffd", text)
-
-
-# Most names of other files in a note; the rest is counted.
-MOST_NAMED = 5
-
-
-def write_folder(path: Path, files: Mapping[str, bytes]) -> list[str]:
-    """Write a folder of files, each atomically; returns a note if it has other files, as of an earlier export.
-
-    Raises:
-        DataError: A file has that name, or the folder cannot be written.
-    """
-    if path.exists() and not path.is_dir():
-        raise DataError(
-            "is a file, and this format is a folder of files", where=str(path), hint="give the name of a folder"
-        )
-    for name, content in files.items():
-        write_atomic(path / name, content)
-    others = sorted(entry.name for entry in path.iterdir() if entry.name not in files and entry.name[0] != ".")
-    if not others:
-        return []
-    named = ", ".join(others[:MOST_NAMED]) + (", ..." if len(others) > MOST_NAMED else "")
-    return [f"the folder also holds {len(others)} other files, which stay as they are: {named}"]
 
 
 def element(

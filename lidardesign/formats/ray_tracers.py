@@ -41,15 +41,8 @@ from lidardesign.formats.mounts import (
     places,
     require_rays,
 )
-from lidardesign.formats.names import (
-    child,
-    document,
-    element,
-    identifier,
-    numbers,
-    renamed_note,
-    write_folder,
-)
+from lidardesign.formats.names import child, document, element, identifier, numbers, renamed_note
+from lidardesign.run.files import write_folder
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import SPEED_OF_LIGHT_M_S
 from lidardesign.sensors.bandwidth import Bandwidth

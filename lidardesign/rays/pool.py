@@ -34,7 +34,7 @@ from lidardesign.run.arrays import read_npz
 from lidardesign.run.clock import phase
 from lidardesign.run.files import write_atomic
 from lidardesign.run.inputs import SAMPLES
-from lidardesign.run.manifest import versions
+from lidardesign.run.manifest import locked_run, versions
 from lidardesign.run_folder import RunFolder, input_hashes
 from lidardesign.samples import Samples
 from lidardesign.scenes.rays import Rays
@@ -102,7 +102,8 @@ def cached_information(
     selection: Selection, training: TrainingScenes, count: int, progress: Callable[[str], None]
 ) -> tuple[list[InformedScene], list[InformedScene]]:
     """As `inform_enough`: from the run's cache, else computed and cached where it can be written."""
-    path, key = training.run.folder / FILE_NAME, _key(selection, training, count)
+    run = training.run
+    path, key = run.folder / FILE_NAME, _key(selection, training, count)
     with contextlib.suppress(LidardesignError, KeyError, ValueError):
         arrays = read_npz(path, SAMPLES)
         if bytes(arrays["key"]).decode() == key:
@@ -112,8 +113,8 @@ def cached_information(
     buffer = io.BytesIO()
     np.savez(buffer, key=np.frombuffer(key.encode(), dtype=np.uint8), **arrays)
     if buffer.tell() <= MOST_BYTES:
-        # a run that cannot be written, or a full disk, costs time alone
-        with contextlib.suppress(LidardesignError):
+        # a run that is gone or cannot be written, or a full disk, costs time alone
+        with contextlib.suppress(LidardesignError), locked_run(run.folder, run.created, wait_s=0.0):
             write_atomic(path, buffer.getvalue())
     # rounded as the file rounds it
     return _unpacked(arrays)

@@ -10,11 +10,9 @@ from __future__ import annotations
 import contextlib
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextvars import ContextVar
-from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 # Called with what is done, how much of it, and of how much; None where that is not counted.
 Progress = Callable[[str, int | None, int | None], None]
@@ -107,35 +105,3 @@ def peak_memory_bytes() -> int | None:
         return None
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * KIBIBYTE
-
-
-def keep_timings(
-    run: Path, command: str, clock: Clock, *, wait_s: float = WAIT_S, further: Mapping[str, Any] | None = None
-) -> None:
-    """Enter a command's times in a run's manifest, in place of those of the last time, under the run's lock.
-
-    Arguments:
-        run: The run folder.
-        command: Its name.
-        clock: Its clock.
-        wait_s: Time to wait for another writer [s].
-        further: Mappings of the manifest that get further entries, by name.
-
-    Raises:
-        ConfigError, DataError: The run is being written, or cannot be.
-    """
-    # every command has a clock, `--help` too: what only some need is not imported for all
-    from lidardesign.run.files import run_lock
-    from lidardesign.run.manifest import read_manifest, write_manifest
-
-    entry: dict[str, Any] = {
-        "when": datetime.now(UTC).isoformat(timespec="seconds"),
-        "seconds": round(clock.seconds, 3),
-        "peak_memory_bytes": peak_memory_bytes(),
-        "phases": clock.timings(),
-    }
-    with run_lock(run, wait_s=wait_s):
-        manifest = read_manifest(run)
-        commands = {name: times for name, times in manifest.get("timings", {}).items() if isinstance(times, dict)}
-        merged = {name: {**(manifest.get(name) or {}), **entries} for name, entries in (further or {}).items()}
-        write_manifest(run, {**manifest, "timings": {**commands, command: entry}, **merged})

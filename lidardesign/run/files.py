@@ -1,6 +1,6 @@
-"""Files that are either whole or absent.
+"""Files that are either whole or absent, and folders that are the old or the new one, or name what is unfinished.
 
-A temporary file names its process, and is removed once that process is gone.
+What is temporary names its process, and is removed once that process is gone.
 
 One writer per run folder: a lock of the operating system, which frees it however its process ends.
 
@@ -10,18 +10,23 @@ The lock file names who holds it; it is there for as long as it is held.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import functools
+import glob
 import hashlib
 import json
 import os
 import re
 import secrets
+import shutil
 import socket
-from collections.abc import Iterator
+import sys
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.run.inputs import RECORD, STATE, check_file, parse_json, read_file
+from lidardesign.run.clock import WAIT_S
+from lidardesign.run.inputs import RECORD, STATE, UNFINISHED, check_file, parse_json, read_file, unfinished_names
 
 HOST_DIGITS = 8
 
@@ -67,7 +72,6 @@ def write_atomic(path: Path, content: bytes | str) -> None:
         DataError: The disk is full, the folder is read-only, or anything else the system reports.
         BrokenPipeError: The reader of a pipe ended.
     """
-    path = Path(path)
     if path.is_symlink() and (path.is_file() or not path.exists()):
         path = Path(os.path.realpath(path))  # a rename would replace the link
     # names of files may be no UTF-8; they are shown escaped then
@@ -80,12 +84,8 @@ def write_atomic(path: Path, content: bytes | str) -> None:
             _write_straight(path, payload)
         else:
             temporary = temporary_beside(path)
-            _remove_abandoned(temporary)
             try:
-                with temporary.open("xb") as file:
-                    file.write(payload)
-                    file.flush()
-                    os.fsync(file.fileno())
+                _write_new(temporary, payload)
                 os.replace(temporary, path)
             except BaseException:
                 with contextlib.suppress(OSError):
@@ -102,6 +102,14 @@ def write_atomic(path: Path, content: bytes | str) -> None:
         raise
     except OSError as error:
         raise _unwritten(path, error) from error
+
+
+def _write_new(path: Path, payload: bytes) -> None:
+    """Write a file that is not there yet, to the disk."""
+    with path.open("xb") as file:
+        file.write(payload)
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def _write_straight(path: Path, payload: bytes) -> None:
@@ -132,19 +140,115 @@ def _unwritten(path: Path, error: OSError) -> DataError:
 
 
 def temporary_beside(path: Path) -> Path:
-    """A unique temporary path beside a file, named after its computer and process."""
-    name = os.fsdecode(os.fsencode(path.name)[:NAME_BYTES])
-    return path.with_name(f".{name}.{host_mark()}-{os.getpid()}.{secrets.token_hex(4)}{TEMPORARY_SUFFIX}")
+    """A unique temporary path beside a path, named after its computer and process.
+
+    What processes of this computer that were killed left of the same kind is removed.
+    """
+    beginning = f".{os.fsdecode(os.fsencode(path.name)[:NAME_BYTES])}.{host_mark()}-"
+    remove_strays(path.parent.glob(f"{glob.escape(beginning)}*{TEMPORARY_SUFFIX}"))
+    return path.with_name(f"{beginning}{os.getpid()}.{secrets.token_hex(4)}{TEMPORARY_SUFFIX}")
 
 
-def _remove_abandoned(temporary: Path) -> None:
-    """Remove the temporary files of the same target that processes of this computer left when they were killed."""
-    beginning = temporary.name.rsplit("-", 1)[0]
-    for name in os.listdir(temporary.parent):
-        found = _TEMPORARY.fullmatch(name) if name.startswith(beginning) else None
-        if found and is_gone(int(found["pid"])):
-            with contextlib.suppress(OSError):
-                temporary.with_name(name).unlink()
+def remove(path: Path) -> None:
+    """Remove a file, or a folder with all that is in it."""
+    shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink(missing_ok=True)
+
+
+# Most names in a note; the rest is counted.
+MOST_NAMED = 6
+# Of the system call renameat2: paths as they are, and both of them exchanged.
+_FROM_HERE, _EXCHANGE = -100, 2
+
+
+def write_folder(path: Path, files: Mapping[str, bytes]) -> list[str]:
+    """Write a set of files as a folder, of which a reader, or a kill at any time, finds the old or the new one.
+
+    They are written to a folder beside it, which takes its place in one step. A folder that also holds other files, or
+    is a mount point or the working folder, stays: its files are replaced one by one while `UNFINISHED` names them.
+
+    Arguments:
+        path: The folder; missing folders are made.
+        files: Content by name; names of files in subfolders have forward slashes.
+
+    Returns:
+        A note if it holds other files, as of an earlier export; they stay.
+
+    Raises:
+        DataError: A file has that name, the folder cannot be written, or another process is writing it.
+    """
+    place = Path(os.path.realpath(path))
+    try:
+        entries = list(os.scandir(place)) if place.exists() else []
+        whole = not place.exists() or (
+            all(entry.name in files and entry.is_file(follow_symlinks=False) for entry in entries)
+            and os.access(place.parent, os.W_OK)
+            and not is_held(place)
+        )
+        folder = temporary_beside(place)
+        if not whole:
+            folder = temporary_beside(place / UNFINISHED)
+        try:
+            for name, content in files.items():
+                (folder / name).parent.mkdir(parents=True, exist_ok=True)
+                _write_new(folder / name, content)
+            if not (whole and _takes_place(folder, place)):
+                _move_files(folder, place, files)
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+    except OSError as error:
+        raise _unwritten(path, error) from error
+    tops = {UNFINISHED, *(Path(name).parts[0] for name in files)}
+    others = sorted(entry.name for entry in entries if entry.name not in tops and entry.name[0] != ".")
+    note = f"the folder also holds {len(others)} other files, which stay as they are: {named(others)}"
+    return [note] if others else []
+
+
+def named(names: Sequence[str]) -> str:
+    """The first of some names, and how many more there are."""
+    return ", ".join(names[:MOST_NAMED]) + (f" and {len(names) - MOST_NAMED} more" if names[MOST_NAMED:] else "")
+
+
+def is_held(folder: Path) -> bool:
+    """True for a mount point, and where this process works inside a folder: another one cannot take its place."""
+    return os.path.ismount(folder) or Path.cwd().is_relative_to(os.path.realpath(folder))
+
+
+def _takes_place(folder: Path, place: Path) -> bool:
+    """Put a folder in place of one with some of its files; False where that has to stay."""
+    if not place.exists():
+        os.rename(folder, place)
+        return True
+    names, old, new = {*os.listdir(folder)}, place.stat(), folder.stat()
+    # whose it is, and who may read it, stays
+    alike = (old.st_uid, old.st_gid, old.st_mode) == (new.st_uid, new.st_gid, new.st_mode)
+    if not (alike and exchange(folder, place)):
+        return False
+    for name in {*os.listdir(folder)} - names:  # it came meanwhile
+        os.rename(folder / name, place / name)
+    return True
+
+
+def exchange(one: Path, other: Path) -> bool:
+    """Exchange two folders in one step; False where the system, or the file system, cannot."""
+    call = getattr(ctypes.CDLL(None), "renameat2", None) if sys.platform == "linux" else None
+    return call is not None and not call(_FROM_HERE, os.fsencode(one), _FROM_HERE, os.fsencode(other), _EXCHANGE)
+
+
+def _move_files(folder: Path, place: Path, names: Collection[str]) -> None:
+    """Move files from one folder to another; a file that lists them is there, and locked, until all of them are."""
+    from filelock import FileLock
+
+    marker = place / UNFINISHED
+    if in_the_way := [name for name in names if (place / name).is_dir()]:
+        raise DataError(f"{named(in_the_way)}: is a folder", where=str(place), hint="move it, or give another place")
+    with FileLock(marker, timeout=WAIT_S):
+        left = [name for name in unfinished_names(place) if name not in names]
+        marker.write_text("\n".join([*names, *left]), encoding="utf-8")
+        for name in names:
+            (place / name).parent.mkdir(parents=True, exist_ok=True)
+            os.replace(folder / name, os.path.realpath(place / name))
+        # removed while locked, so that a process that opened it meanwhile finds it gone
+        marker.write_text("\n".join(left), encoding="utf-8") if left else marker.unlink()
 
 
 def is_temporary(name: str) -> bool:
@@ -152,20 +256,16 @@ def is_temporary(name: str) -> bool:
     return _TEMPORARY.fullmatch(name) is not None
 
 
-def remove_stray_temporaries(folder: Path) -> list[Path]:
-    """Remove temporary files that killed processes left in a folder and its subfolders; returns what was removed.
+def remove_strays(paths: Iterable[Path]) -> None:
+    """Remove what is temporary among some paths, unless it is of a process of this computer that still runs.
 
-    Call it only while no other computer writes there (the run's lock is held).
+    That of other computers is removed too: where they may be at work, leave it out.
     """
-    removed = []
-    for stray in sorted([*Path(folder).glob(f".*{TEMPORARY_SUFFIX}"), *Path(folder).glob(f"*/.*{TEMPORARY_SUFFIX}")]):
-        found = _TEMPORARY.fullmatch(stray.name)
-        at_work = found and found["host"] == host_mark() and not is_gone(int(found["pid"]))
-        if found and not at_work:
+    for path in paths:
+        found = _TEMPORARY.fullmatch(path.name)
+        if found and (found["host"] != host_mark() or is_gone(int(found["pid"]))):
             with contextlib.suppress(OSError):
-                stray.unlink()
-                removed.append(stray)
-    return removed
+                remove(path)
 
 
 def sha256_file(path: Path) -> str:
@@ -228,7 +328,7 @@ def run_lock(run: Path, *, wait_s: float = 0.0) -> Iterator[None]:
     try:
         with contextlib.suppress(OSError):  # a lock without a name holds as well
             path.write_text(json.dumps({"pid": os.getpid(), "host": socket.gethostname()}), encoding="utf-8")
-        remove_stray_temporaries(Path(run))
+        remove_strays([*path.parent.glob(f".*{TEMPORARY_SUFFIX}"), *path.parent.glob(f"*/.*{TEMPORARY_SUFFIX}")])
         yield
     finally:
         # removed while held, so that a process that opened it meanwhile finds it gone

@@ -18,6 +18,8 @@ from lidardesign.errors import ConfigError, DataError
 HEAD_BYTES = 4096
 FILE_HINT = "give a file"
 POINTER = b"version https://git-lfs.github.com/spec/"
+# In a folder whose files are only partly those of a new set: their names, one a line.
+UNFINISHED = "lidardesign-unfinished.txt"
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,7 @@ def check_file(path: Path | str, kind: Kind, *, allowed: str | None = None, hint
     """The size of a file [bytes], checked to be a regular file within its kind's limit.
 
     Raises:
-        DataError, ConfigError: By the kind: it is missing, no regular file, or too large.
+        DataError, ConfigError: By the kind: it is missing, no regular file, too large, or of an unfinished set.
     """
     try:
         status = os.stat(path)
@@ -78,7 +80,19 @@ def check_file(path: Path | str, kind: Kind, *, allowed: str | None = None, hint
     if not stat.S_ISREG(status.st_mode):
         raise kind.error("is not a regular file", where=str(path), allowed=allowed, hint=hint or FILE_HINT)
     check_bytes(status.st_size, kind, str(path))
+    if os.path.basename(path) in unfinished_names(Path(path).parent):
+        raise kind.error(
+            f"is of a set that is unfinished: only some of the files in {UNFINISHED} were replaced",
+            where=str(path),
+            hint="write them again",
+        )
     return status.st_size
+
+
+def unfinished_names(folder: Path) -> list[str]:
+    """The names of the files of a set in a folder that was left unfinished; none where all are whole."""
+    marker = folder / UNFINISHED
+    return marker.read_text(encoding="utf-8", errors="replace").splitlines() if marker.is_file() else []
 
 
 def check_bytes(size: int, kind: Kind, where: str, *, unpacked: bool = False) -> None:
@@ -99,14 +113,7 @@ def read_file(path: Path | str, kind: Kind, *, allowed: str | None = None, hint:
     Raises:
         DataError, ConfigError: As of `check_file`, or it cannot be read.
     """
-    check_file(path, kind, allowed=allowed, hint=hint)
-    try:
-        with open(path, "rb") as file:
-            content = file.read(kind.most_bytes + 1)
-    except OSError as error:
-        raise kind.error(
-            f"cannot be read: {error.strerror or error}", where=str(path), allowed=allowed, hint=hint
-        ) from None
+    content = _read(path, kind, kind.most_bytes + 1, allowed, hint)
     check_bytes(len(content), kind, str(path))
     if content.startswith(POINTER):
         raise kind.error("is a pointer of Git LFS, not the file itself", where=str(path), hint="git lfs pull")
@@ -119,12 +126,18 @@ def read_head(path: Path | str, kind: Kind, *, hint: str | None = None) -> bytes
     Raises:
         DataError, ConfigError: As of `read_file`.
     """
-    check_file(path, kind, hint=hint)
+    return _read(path, kind, HEAD_BYTES, None, hint)
+
+
+def _read(path: Path | str, kind: Kind, most_bytes: int, allowed: str | None, hint: str | None) -> bytes:
+    check_file(path, kind, allowed=allowed, hint=hint)
     try:
         with open(path, "rb") as file:
-            return file.read(HEAD_BYTES)
+            return file.read(most_bytes)
     except OSError as error:
-        raise kind.error(f"cannot be read: {error.strerror or error}", where=str(path), hint=hint) from None
+        raise kind.error(
+            f"cannot be read: {error.strerror or error}", where=str(path), allowed=allowed, hint=hint
+        ) from None
 
 
 def parse_json(content: bytes | str) -> Any:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import platform
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -13,7 +14,8 @@ from typing import Any
 
 from lidardesign import __version__
 from lidardesign.errors import DataError
-from lidardesign.run.files import sha256_file, write_atomic, writer
+from lidardesign.run.clock import WAIT_S, Clock, peak_memory_bytes
+from lidardesign.run.files import run_lock, sha256_file, write_atomic, writer
 from lidardesign.run.inputs import RECORD, parse_json, read_file
 
 FILE_NAME = "manifest.json"
@@ -38,7 +40,7 @@ def versions() -> dict[str, str]:
     return found
 
 
-def start_manifest(run: Path, *, command: list[str], seed: int) -> dict[str, Any]:
+def start_manifest(run: Path, *, command: list[str], seed: int) -> None:
     """Write the manifest of a new run: versions, command and time; no files yet."""
     manifest = {
         "schema_version": SCHEMA_VERSION,
@@ -50,7 +52,6 @@ def start_manifest(run: Path, *, command: list[str], seed: int) -> dict[str, Any
         "files": {},
     }
     write_manifest(run, manifest)
-    return manifest
 
 
 def read_manifest(run: Path) -> dict[str, Any]:
@@ -59,7 +60,6 @@ def read_manifest(run: Path) -> dict[str, Any]:
     Raises:
         DataError: There is no such run, or its manifest is damaged or of a newer version.
     """
-    run = Path(run)
     path = run / FILE_NAME
     if not run.exists():
         raise DataError("no such run", where=str(run), hint=LEARN_HINT)
@@ -99,24 +99,43 @@ def read_manifest(run: Path) -> dict[str, Any]:
     return manifest
 
 
+@contextlib.contextmanager
+def locked_run(run: Path, created: str | None = None, wait_s: float = WAIT_S) -> Iterator[dict[str, Any]]:
+    """Hold the lock of a run that is still there, and give its manifest.
+
+    Arguments:
+        run: The run folder.
+        created: When the run was made that must be in it; None: any.
+        wait_s: Time to wait for another writer [s].
+
+    Raises:
+        ConfigError: Another process writes this run.
+        DataError: It is gone, another run is in its folder, or it cannot be written.
+    """
+    read_manifest(run)  # the lock would make the folder
+    with run_lock(run, wait_s=wait_s):
+        manifest = read_manifest(run)
+        if created not in (None, manifest.get("created")):
+            raise DataError("another run has taken its place meanwhile", where=str(run), hint="give the command again")
+        yield manifest
+
+
 def write_manifest(run: Path, manifest: dict[str, Any]) -> None:
     """Replace the manifest of a run, atomically."""
-    write_atomic(Path(run) / FILE_NAME, json.dumps(manifest, indent=2) + "\n")
+    write_atomic(run / FILE_NAME, json.dumps(manifest, indent=2) + "\n")
 
 
 def record(run: Path, names: Iterable[str]) -> None:
     """Enter the present size and SHA-256 of files of a run (names relative to it, with forward slashes)."""
-    run = Path(run)
-    manifest = read_manifest(run) if (run / FILE_NAME).exists() else start_manifest(run, command=[], seed=0)
+    manifest = read_manifest(run)
     for name in names:
         path = run / name
         manifest["files"][Path(name).as_posix()] = {"sha256": sha256_file(path), "bytes": path.stat().st_size}
     write_manifest(run, manifest)
 
 
-def forget(run: Path, names: Iterable[str]) -> None:
+def forget(run: Path, names: Collection[str]) -> None:
     """Remove files of a run and then their entries; missing files lose only their entry."""
-    run, names = Path(run), list(names)
     if not names:
         return
     for name in names:
@@ -132,8 +151,7 @@ def announce(run: Path, name: str, content: bytes) -> None:
 
     A process that is killed between the two writes then leaves a file that still verifies.
     """
-    run = Path(run)
-    manifest = read_manifest(run) if (run / FILE_NAME).exists() else start_manifest(run, command=[], seed=0)
+    manifest = read_manifest(run)
     path, key = run / name, Path(name).as_posix()
     entry: dict[str, Any] = {"sha256": hashlib.sha256(content).hexdigest(), "bytes": len(content)}
     if key in manifest["files"] and path.is_file():
@@ -147,7 +165,7 @@ def announce(run: Path, name: str, content: bytes) -> None:
 def write_recorded(run: Path, name: str, content: bytes) -> None:
     """Write a file of a run atomically, with its hash in the manifest at every moment."""
     announce(run, name, content)
-    write_atomic(Path(run) / name, content)
+    write_atomic(run / name, content)
     record(run, [name])
 
 
@@ -157,7 +175,6 @@ def changed_since_recorded(run: Path, name: str) -> str | None:
     Raises:
         DataError: The manifest or the file cannot be read.
     """
-    run = Path(run)
     entry = read_manifest(run)["files"].get(Path(name).as_posix())
     if entry is None or sha256_file(run / name) in _hashes(entry):
         return None
@@ -174,8 +191,7 @@ def _hashes(entry: dict[str, Any]) -> list[str]:
 
 def note(run: Path, **fields: Any) -> None:
     """Merge fields into the manifest; a mapping merges into a mapping of the same name."""
-    run = Path(run)
-    manifest = read_manifest(run) if (run / FILE_NAME).exists() else start_manifest(run, command=[], seed=0)
+    manifest = read_manifest(run)
     for name, value in fields.items():
         old = manifest.get(name)
         manifest[name] = {**old, **value} if isinstance(old, dict) and isinstance(value, dict) else value
@@ -188,7 +204,6 @@ def verify(run: Path, name: str) -> None:
     Raises:
         DataError: No such run; the file was never recorded; it is missing, truncated or changed.
     """
-    run = Path(run)
     path = run / name
     entry = read_manifest(run)["files"].get(Path(name).as_posix())
     if entry is None and path.exists():
@@ -208,3 +223,37 @@ def verify(run: Path, name: str) -> None:
     difference = changed_since_recorded(run, name)
     if difference is not None:
         raise DataError(difference, where=str(path), hint="restore it or learn the run again")
+
+
+def keep_timings(
+    run: Path,
+    command: str,
+    clock: Clock,
+    *,
+    wait_s: float = WAIT_S,
+    created: str | None = None,
+    further: Mapping[str, Any] | None = None,
+) -> None:
+    """Enter a command's times in a run's manifest, in place of those of the last time, under the run's lock.
+
+    Arguments:
+        run: The run folder.
+        command: Its name.
+        clock: Its clock.
+        wait_s: Time to wait for another writer [s].
+        created: When the run was made that must be in it; None: any.
+        further: Mappings of the manifest that get further entries, by name.
+
+    Raises:
+        ConfigError, DataError: The run is being written, or cannot be.
+    """
+    entry: dict[str, Any] = {
+        "when": datetime.now(UTC).isoformat(timespec="seconds"),
+        "seconds": round(clock.seconds, 3),
+        "peak_memory_bytes": peak_memory_bytes(),
+        "phases": clock.timings(),
+    }
+    with locked_run(run, created, wait_s) as manifest:
+        commands = {name: times for name, times in manifest.get("timings", {}).items() if isinstance(times, dict)}
+        merged = {name: {**(manifest.get(name) or {}), **entries} for name, entries in (further or {}).items()}
+        write_manifest(run, {**manifest, "timings": {**commands, command: entry}, **merged})

@@ -47,14 +47,11 @@ def check_outputs(
     for name, path in files.items():
         _check_replaced(name, path, inputs)
     for (name, path), (other, place) in itertools.permutations(places.items(), 2):
-        if name in files and not _is_device(path) and place.resolve().is_relative_to(path.resolve()):
+        # of what is there, neither file nor folder is a device or a pipe
+        is_device = path.exists() and not path.is_file() and not path.is_dir()
+        if name in files and not is_device and place.resolve().is_relative_to(path.resolve()):
             what = "the same file" if place.resolve() == path.resolve() else f"a folder of {other} too"
             raise ConfigError(f"{path} is {what}", where=f"{name} and {other}", hint=ELSEWHERE)
-
-
-def _is_device(path: Path) -> bool:
-    """True for an existing path that is neither a file nor a folder: a device or a pipe."""
-    return path.exists() and not path.is_file() and not path.is_dir()
 
 
 def _check_replaced(name: str, path: Path, inputs: Iterable[Path]) -> None:
@@ -68,11 +65,11 @@ def _check_replaced(name: str, path: Path, inputs: Iterable[Path]) -> None:
     if any(read.is_file() and read.samefile(path) for read in inputs):
         raise ConfigError(f"{path} is an input, and would be overwritten", where=name, hint=ELSEWHERE)
     for folder in path.resolve().parents[:2]:
-        if (folder / MANIFEST).is_file() and path.resolve().relative_to(folder).as_posix() in _files_of(folder):
+        if (folder / MANIFEST).is_file() and path.resolve().relative_to(folder).as_posix() in files_of_run(folder):
             raise ConfigError(f"{path} is a file of the run {folder}", where=name, hint=ELSEWHERE)
 
 
-def _files_of(run: Path) -> set[str]:
+def files_of_run(run: Path) -> set[str]:
     """The names of the files of a run; of one with a damaged manifest only the usual ones."""
     with contextlib.suppress(OSError, ValueError, AttributeError, TypeError):
         return {*RUN_FILES, *parse_json((run / MANIFEST).read_bytes()).get("files", ())}

@@ -26,9 +26,7 @@ from lidardesign.fitting.options import FitOptions
 from lidardesign.formats.registry import EXPORTERS
 from lidardesign.parts.catalogue import load_library
 from lidardesign.report.figures import OUTCOME_WORDS
-from lidardesign.run.clock import WAIT_S
-from lidardesign.run.files import run_lock
-from lidardesign.run.manifest import write_recorded
+from lidardesign.run.manifest import locked_run, write_recorded
 from lidardesign.run.yaml import dump_yaml
 from lidardesign.run_folder import ignore
 from lidardesign.samples import load_samples
@@ -414,7 +412,7 @@ class Studio:
             raise ConfigError(f"there is a design {name!r}", where="name", allowed="another name")
         design = Design(replace(choices.design.specification, name=name), self.run, None, choices.design.result)
         design.save()
-        with run_lock(folder, wait_s=WAIT_S):
+        with locked_run(folder, self.run.created):
             write_recorded(folder, f"{CONSTRAINTS}/{name}.yaml", dump_yaml(dict(choices.constraints)).encode())
         self.saved[name] = design
         self._panel.add_design(name)

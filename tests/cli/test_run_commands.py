@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import errno
+import importlib
 import shlex
+import shutil
 import sys
 from pathlib import Path
 
@@ -15,7 +17,7 @@ from support.plugins import GOOD, install_plugins
 from lidardesign.cli.main import app
 from lidardesign.rays.pool import FILE_NAME as CACHE
 from lidardesign.run.files import run_lock
-from lidardesign.run.manifest import note, read_manifest, verify
+from lidardesign.run.manifest import note, read_manifest, record, verify, write_manifest
 
 TINY = ("steps=2", "batch=64", "samples=1000", "balance_proposals=256", "coverage_proposals=256", "hidden=4")
 SET_TINY = ("train=1", *(f"learning.{one}" for one in TINY))
@@ -57,16 +59,22 @@ def test_hints_can_be_pasted_whatever_a_folder_is_called(lidardesign, flat):
     assert pasted(result.err) == ["fit", str(flat)]
 
 
+OTHERS = ("rows.csv", "designs/drawn/by hand.yaml")
+
+
 def learned(lidardesign, *arguments):
     return lidardesign("learn", "flatland", *set_options(SET_TINY, arguments), "--out", "run", *arguments)
 
 
 @pytest.fixture
 def old(lidardesign, tmp_path):
-    """The files of a run that was learned with the seed 0, and has a design."""
+    """The files of a run that was learned with the seed 0, and has a design; and others that the run did not write."""
     assert learned(lidardesign).code == 0
-    (tmp_path / "run" / "designs").mkdir()
+    (tmp_path / "run" / "designs" / "drawn").mkdir(parents=True)
     (tmp_path / "run" / "designs" / "mine.yaml").write_text("name: mine\n")
+    record(tmp_path / "run", ["designs/mine.yaml"])
+    for name in OTHERS:
+        (tmp_path / "run" / name).write_text(name)
     return files_under(tmp_path)
 
 
@@ -80,9 +88,12 @@ def test_a_run_is_replaced_only_where_that_is_asked_for(lidardesign, old, tmp_pa
 def test_a_replaced_run_is_the_one_that_another_folder_would_have_got(lidardesign, old, tmp_path):
     result = learned(lidardesign, "--seed", 1, "--overwrite", "--json")
     assert (result.code, result.json["run"]) == (0, "run")
-    assert "note: once it is learned it replaces the run run, with its designs (mine)" in result.err
+    assert "note: once it is learned it replaces the run run, with its designs (mine); what is not of the run " in (
+        result.err
+    )
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
-    assert not (tmp_path / "run" / "designs").exists()
+    assert not (tmp_path / "run" / "designs" / "mine.yaml").exists()
+    assert [(tmp_path / "run" / name).read_text() for name in OTHERS] == [*OTHERS]
     assert read_manifest(tmp_path / "run")["learn"]["run"] == "run"
     verify(tmp_path / "run", "samples.npz")
     lidardesign("learn", "flatland", *LEARN_TINY, "--out", "other", "--seed", 1)
@@ -91,7 +102,8 @@ def test_a_replaced_run_is_the_one_that_another_folder_would_have_got(lidardesig
 
 
 def test_what_would_be_replaced_is_said_before(lidardesign, old, tmp_path):
-    assert "replaces the run run, with its designs (mine)" in learned(lidardesign, "--overwrite", "--dry-run").err
+    said = learned(lidardesign, "--overwrite", "--dry-run").err
+    assert "with its designs (mine); what is not of the run stays: designs/drawn/by hand.yaml, rows.csv" in said
     assert files_under(tmp_path) == old
 
 
@@ -129,12 +141,68 @@ def test_both_runs_are_kept_where_a_folder_cannot_be_renamed(lidardesign, old, t
 
     with monkeypatch.context() as patch:
         patch.setattr(Path, "rename", refuse)
+        patch.setattr("lidardesign.api.learn.exchange", lambda *_: False)
         result = learned(lidardesign, "--seed", 1, "--overwrite")
     assert result.code == 3
     assert "run.new: cannot replace run: Permission denied" in result.err
     now = files_under(tmp_path)
     assert {name: now[name] for name in old} == old
     verify(tmp_path / "run.new", "samples.npz")
+
+
+# A command, and the function before which its run goes.
+MEANWHILE = [
+    (["fit", "--layout", "even", "--name", "mine"], "design.Design.save"),
+    (["constrain", "--set", "gate.width_m.max=0.5", "--layout", "even", "--name", "mine"], "design.Design.save"),
+    (["evaluate", "--baseline", "none", "--json"], "scores.Scores.last_scores"),
+]
+
+
+@pytest.mark.parametrize("another", [False, True])
+@pytest.mark.parametrize(("arguments", "before"), MEANWHILE)
+def test_a_run_that_is_gone_does_not_come_back_and_another_in_its_place_gets_nothing(
+    lidardesign, tmp_path, monkeypatch, another, arguments, before
+):
+    run = make_run(tmp_path / "run", count=1000, overrides=["test=2"])
+    assert lidardesign("fit", run, "--sensors", 1, "--rays", 8, "--layout", "even").code == 0
+    shutil.copytree(run, tmp_path / "other")
+    write_manifest(tmp_path / "other", {**read_manifest(run), "created": "2020-01-01T00:00:00+00:00"})
+    expected = files_under(tmp_path / "other") if another else None
+    real = getattr(importlib.import_module(f"lidardesign.api.{before.split('.')[0]}"), before.split(".")[1])
+    name = before.split(".")[2]
+    work = getattr(real, name)
+
+    def strike(*given):
+        shutil.rmtree(run)
+        if another:
+            (tmp_path / "other").rename(run)
+        return work(*given)
+
+    monkeypatch.setattr(real, name, strike)
+    sensors = [] if arguments[0] == "evaluate" else ["--sensors", 1]
+    result = lidardesign(arguments[0], run, *sensors, "--rays", 8, *arguments[1:])
+    assert result.code == 3
+    assert ("another run has taken its place" if another else "run: no such run") in result.err
+    assert (files_under(run) if run.exists() else None) == expected
+    if arguments[0] == "evaluate":
+        assert result.json["rows"], "what was worked for is given all the same"
+
+
+@pytest.mark.parametrize("arguments", [["fit", "run"], ["learn", "flatland"], ["tasks", "check", "flatland"]])
+def test_a_working_folder_that_is_gone_is_named(lidardesign, tmp_path, monkeypatch, arguments):
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    result = lidardesign(*arguments)
+    assert result.code == 3
+    assert "data error: the working folder no longer exists" in result.err
+
+
+def test_a_run_that_cannot_be_exchanged_is_not_replaced(lidardesign, old, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path / "run" / "designs")
+    refused = lidardesign("learn", "flatland", *LEARN_TINY, "--out", "..", "--overwrite")
+    assert refused.code == 2
+    assert "holds the working folder: it cannot be replaced" in refused.err
 
 
 def test_a_run_whose_plugin_is_gone_names_the_package(lidardesign, tmp_path, monkeypatch):

@@ -7,12 +7,12 @@ import shutil
 from dataclasses import replace
 
 import pytest
-from support.learning import BallTask, Interrupter, config_of, result_bytes
+from support.learning import BallTask, Interrupter, config_of, learn, result_bytes
 
 from lidardesign.api.learn import MOST_STEPS
 from lidardesign.density.training import trainer as training
 from lidardesign.density.training.checkpoint import load_arrays
-from lidardesign.density.training.learn import learn, prepare_training_data
+from lidardesign.density.training.learn import prepare_training_data
 
 STRETCH = 10
 # The flow misplaces more when balancing begins, and less after all steps.

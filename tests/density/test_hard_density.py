@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from support import references
 from support.designs import from_the_ceiling
 from support.fits import fitted
-from support.learning import SMALL, BallTask
+from support.learning import SMALL, BallTask, learn
 from support.visibility import along_axis, both_ways, config_of, plate, transmittance_on, wall
 
 from lidardesign.config import (
@@ -36,7 +36,6 @@ from lidardesign.density.objective.quadrature import Quadrature
 from lidardesign.density.objective.surfaces import MovingFrames
 from lidardesign.density.objective.target import build_target
 from lidardesign.density.objective.visibility import MINIMUM_COSINE, Optics, RayBatch, Raycast
-from lidardesign.density.training.learn import learn
 from lidardesign.density.training.losses import Pool, balancing_loss, pathwise_loss
 from lidardesign.errors import ConfigError
 from lidardesign.rays.proposals import Proposals

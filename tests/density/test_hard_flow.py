@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support import references
 from support.flows import FLOWS, draw, flow_of
-from support.learning import SPACE, BallTask, Interrupter, a_trainer, config_of, result_bytes
+from support.learning import SPACE, BallTask, Interrupter, a_trainer, config_of, learn, result_bytes
 from support.spaces import log_volume
 
 from lidardesign.config import DensitySettings
@@ -24,7 +24,7 @@ from lidardesign.density.objective.target import Target
 from lidardesign.density.training import quality as measure
 from lidardesign.density.training import trainer as training
 from lidardesign.density.training.checkpoint import load_arrays
-from lidardesign.density.training.learn import learn, make_trainer, prepare_training_data
+from lidardesign.density.training.learn import make_trainer, prepare_training_data
 from lidardesign.density.training.losses import TOLERANCE_NATS, round_trip_nats
 from lidardesign.errors import DivergenceError
 from lidardesign.samples import load_samples

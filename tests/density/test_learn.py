@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from support.learning import SPACE, BallTask, Interrupter, a_trainer, config_of, result_bytes
+from support.learning import SPACE, BallTask, Interrupter, a_trainer, config_of, learn, result_bytes
 
 from lidardesign.density.training import learn as learning
 from lidardesign.density.training.checkpoint import (
@@ -21,7 +21,7 @@ from lidardesign.density.training.checkpoint import (
     snapshot_name,
     stored_snapshots,
 )
-from lidardesign.density.training.learn import learn, prepare_training_data
+from lidardesign.density.training.learn import prepare_training_data
 from lidardesign.density.training.sampling import log_density_of
 from lidardesign.density.training.trainer import AVERAGING, BETAS, Adam
 from lidardesign.errors import ConfigError, DataError

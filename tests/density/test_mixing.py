@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 from scipy.stats import multivariate_normal
-from support.learning import BallTask, Interrupter, a_trainer, config_of
+from support.learning import BallTask, Interrupter, a_trainer, config_of, learn
 
 from lidardesign.density.objective.proposals import independent_points, log_proposal
-from lidardesign.density.training.learn import draft_note, learn, prepare_training_data
+from lidardesign.density.training.learn import draft_note, prepare_training_data
 from lidardesign.density.training.sampling import KnownPoints, effective_count_of_mixture, log_constant, mixed
 from lidardesign.estimates import Estimate
 from lidardesign.samples import Samples

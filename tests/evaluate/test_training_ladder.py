@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.learning import learn
 from support.small_runs import shifted
 
 from lidardesign.api import scores as scoring
@@ -15,7 +16,6 @@ from lidardesign.api.run import open_run
 from lidardesign.config import load_run_config, resolve, save_run_config
 from lidardesign.density.objective.proposals import independent_samples
 from lidardesign.density.training import trainer as steps
-from lidardesign.density.training.learn import learn
 from lidardesign.density.training.learned import load_flow, remeasured, seconds_at
 from lidardesign.density.training.trainer import Trainer
 from lidardesign.errors import DataError, NumericalError

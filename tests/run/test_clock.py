@@ -12,9 +12,9 @@ import pytest
 
 from lidardesign.errors import ConfigError
 from lidardesign.run import clock as clocks
-from lidardesign.run.clock import Clock, keep_timings, peak_memory_bytes, phase, running
+from lidardesign.run.clock import Clock, peak_memory_bytes, phase, running
 from lidardesign.run.files import run_lock
-from lidardesign.run.manifest import read_manifest, start_manifest
+from lidardesign.run.manifest import keep_timings, read_manifest, start_manifest
 
 
 class Hands:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
+import itertools
 import json
 import os
 import socket
@@ -11,13 +13,15 @@ import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 
 import pytest
 
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.run import files
 from lidardesign.run import manifest as manifest_module
-from lidardesign.run.files import remove_stray_temporaries, run_lock, write_atomic
+from lidardesign.run.files import run_lock, write_atomic, write_folder
+from lidardesign.run.inputs import RECORD, UNFINISHED, read_file
 from lidardesign.run.manifest import (
     announce,
     note,
@@ -87,7 +91,7 @@ def test_a_folder_is_not_a_file(tmp_path):
 
 
 def test_a_device_is_written_straight():
-    write_atomic("/dev/null", b"gone")
+    write_atomic(Path("/dev/null"), b"gone")
     assert stat.S_ISCHR(os.stat("/dev/null").st_mode), "a rename over it would have left a file"
 
 
@@ -108,14 +112,150 @@ def test_the_next_writer_of_a_file_removes_what_a_killed_one_left(tmp_path, name
 
 def test_the_run_s_next_writer_cleans_its_folders_but_not_what_is_at_work_or_not_ours(tmp_path):
     (tmp_path / "designs").mkdir()
+    left = tmp_path / f".mounts.{'0' * 8}-{GONE}.0.tmp" / "half"
+    left.mkdir(parents=True)
     at_work = files.temporary_beside(tmp_path / "designs" / "fit.yaml")
     abandoned = at_work.with_name(at_work.name.replace(f"-{os.getpid()}.", f"-{GONE}."))
     foreign = tmp_path / "designs" / ".notes.tmp"
     for path in (at_work, abandoned, foreign):
         path.write_bytes(b"half")
-    assert remove_stray_temporaries(tmp_path) == [abandoned]
-    assert at_work.exists()
-    assert foreign.exists()
+    with run_lock(tmp_path):
+        assert {*tmp_path.iterdir()} == {tmp_path / ".lock", tmp_path / "designs"}
+        assert {*(tmp_path / "designs").iterdir()} == {at_work, foreign}
+
+
+OLD, NEW = ({name: f"{word} {name}".encode() for name in "abc"} for word in ("old", "new"))
+# Every step by which what is on the disk changes.
+STEPS = [
+    *((os, name) for name in ("fsync", "mkdir", "rename", "replace")), (Path, "write_text"),
+    (files, "exchange"), (os, "rmdir"), (os, "unlink"),
+]  # fmt: skip
+PLACES = ("absent", "empty", "old", "a link", "among others", "its own mode", "the working folder", "no exchange")
+
+
+def place_of(kind, folder, patch):
+    """A folder of a kind, with the old set of files in it."""
+    folder = folder / kind.replace(" ", "_")
+    if kind not in ("absent", "empty"):
+        write_folder(folder, OLD)
+    if kind == "empty":
+        folder.mkdir(parents=True)
+    elif kind == "a link":
+        folder.rename(folder.with_name("far"))
+        folder.symlink_to("far")
+    elif kind == "among others":
+        (folder / "mine").write_bytes(b"mine")
+    elif kind == "its own mode":
+        folder.chmod(0o750)
+    elif kind == "the working folder":
+        patch.chdir(folder)
+    elif kind == "no exchange":
+        patch.setattr(files, "exchange", lambda *_: False)
+    return folder
+
+
+def at_step(patch, number, act, steps=STEPS):
+    """Do something instead of one of some steps; gives the list of those that were taken."""
+    taken = []
+
+    def counting(real, name):
+        def step(*given, **options):
+            taken.append(name)
+            return act() if len(taken) == number else real(*given, **options)
+
+        return step
+
+    for owner, name in steps:
+        patch.setattr(owner, name, counting(getattr(owner, name), name))
+    return taken
+
+
+def state(folder):
+    """What a set is: old, new, absent or unfinished, as it says itself; None where it is mixed and says nothing."""
+    found = {name: (folder / name).read_bytes() for name in NEW if (folder / name).exists()}
+    if (folder / UNFINISHED).exists() and (folder / UNFINISHED).read_bytes():
+        with pytest.raises(DataError, match="a set that is unfinished"):
+            read_file(folder / "a", RECORD)
+        return "unfinished"
+    return next((word for word, whole in (("absent", {}), ("old", OLD), ("new", NEW)) if found == whole), None)
+
+
+def killed_at(number, folder):
+    """Write the new set in a fork that ends at a step; whether it got so far."""
+    child = os.fork()
+    if not child:
+        at_step(pytest.MonkeyPatch(), number, lambda: os._exit(9))
+        write_folder(folder, NEW)
+        os._exit(0)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 9
+
+
+def full_at(number, folder):
+    """Write the new set on a disk that is full at a step; whether it got so far."""
+
+    def fail():
+        raise FULL
+
+    with pytest.MonkeyPatch.context() as patch:
+        taken = at_step(patch, number, fail, STEPS[:-3])
+        with contextlib.suppress(DataError):
+            write_folder(folder, NEW)
+    return len(taken) >= number
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="a kill is tried in a fork")
+@pytest.mark.parametrize("kind", PLACES)
+@pytest.mark.parametrize("fails_at", [killed_at, full_at])
+def test_a_folder_is_the_old_or_the_new_one_or_names_itself_unfinished_whatever_step_fails(tmp_path, kind, fails_at):
+    found = set()
+    for number in itertools.count(1):
+        with pytest.MonkeyPatch.context() as patch:
+            folder = place_of(kind, tmp_path / str(number), patch)
+            before, mode = state(folder), folder.stat().st_mode if folder.exists() else None
+            failed = fails_at(number, folder)
+            left = state(folder)
+            assert left in (before, "new", "unfinished")
+            found |= {left} if failed else set()
+            write_folder(folder, NEW)
+            assert (state(folder), [*folder.parent.rglob(".*")]) == ("new", [])
+            assert (folder / "mine").exists() == (kind == "among others")
+            assert folder.is_symlink() == (kind == "a link")
+            assert mode in (None, folder.stat().st_mode)
+        if not failed:
+            break
+    assert number > len(NEW)
+    assert ("unfinished" in found) == (kind in PLACES[4:])
+
+
+def test_a_set_that_is_unfinished_stays_named_until_its_own_files_are_whole(tmp_path):
+    (tmp_path / UNFINISHED).write_text("a\nz")
+    write_folder(tmp_path, NEW)
+    assert (tmp_path / UNFINISHED).read_text() == "z"
+    assert read_file(tmp_path / "a", RECORD) == NEW["a"]
+
+
+def test_a_folder_in_the_way_of_a_file_is_named_and_nothing_is_replaced(tmp_path):
+    write_folder(tmp_path / "set", OLD)
+    (tmp_path / "set" / "b").unlink()
+    (tmp_path / "set" / "b").mkdir()
+    with pytest.raises(DataError, match="b: is a folder"):
+        write_folder(tmp_path / "set", NEW)
+    assert {path.name for path in (tmp_path / "set").iterdir()} == {*OLD}
+    assert (tmp_path / "set" / "a").read_bytes() == OLD["a"]
+
+
+def test_two_writers_of_one_folder_do_not_mix(tmp_path):
+    for kind in ("old", "among others"):
+        with pytest.MonkeyPatch.context() as patch:
+            folder = place_of(kind, tmp_path, patch)
+        sets = [{name: bytes([number]) for name in "abc"} for number in range(8)]
+        writers = [threading.Thread(target=write_folder, args=(folder, one)) for one in sets]
+        for writer in writers:
+            writer.start()
+        for writer in writers:
+            writer.join()
+        assert {name: (folder / name).read_bytes() for name in "abc"} in sets
+        assert not [*folder.parent.rglob(".*")]
 
 
 def test_a_recorded_file_verifies_and_the_manifest_says_what_made_it(run):

@@ -11,6 +11,7 @@ from lidardesign.config import DensitySettings, LearningSettings, RunConfig
 from lidardesign.density.training import learn as learning
 from lidardesign.density.training import trainer as training
 from lidardesign.density.training.learn import prepare_training_data
+from lidardesign.run.manifest import FILE_NAME, start_manifest
 from lidardesign.scenes.scene import Body, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace
 from lidardesign.task import Defaults, Metric, TaskConfig
@@ -47,6 +48,13 @@ def config_of(space=SPACE, seed=3, **settings):
         task_name="ball", seed=shifted(seed), preset="draft", task=TaskConfig(), space=space,
         density=DensitySettings(sigma_m=0.05), learning=LearningSettings(**{**SMALL, **settings}),
     )  # fmt: skip
+
+
+def learn(task, config, run, **options):
+    """Learn in a folder, which is made a run as by the command."""
+    if not (run / FILE_NAME).exists():
+        start_manifest(run, command=[], seed=config.seed)
+    return density_learn.learn(task, config, run, **options)
 
 
 def result_bytes(run):

@@ -237,7 +237,8 @@ def evaluate(
 
         with ExitStack() as rest:  # the scores are shown whatever becomes of the files and of what is measured further
             rest.callback(show_result)
-            rest.callback(keep_times, request.run.folder, "evaluate", output, further=scores.last_scores())
+            run, further = request.run, scores.last_scores()
+            rest.callback(keep_times, run.folder, "evaluate", output, created=run.created, further=further)
             # accuracy takes minutes: what was scored by then is written already
             _write_files(scores, written, *files.values())
             if accuracy:

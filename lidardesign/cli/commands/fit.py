@@ -100,7 +100,7 @@ def run_fit(request: FitRequest, output: Output, workers: str) -> None:
         output.keep(design_text(design.specification, Path(design.name)), ".yaml")
         raise
     document = design.as_dict()
-    keep_times(request.run.folder, request.command, output, wait_s=WAIT_S)
+    keep_times(request.run.folder, request.command, output, wait_s=WAIT_S, created=request.run.created)
 
     def show(rich: RichConsole) -> None:
         checks = design.result.constraints if design.result else ()

@@ -25,8 +25,9 @@ import typer
 from lidardesign.cli.terminal.grids import ProgressDisplay, duration
 from lidardesign.cli.terminal.score_tables import show_times
 from lidardesign.errors import BackgroundNote, ConfigError, DataError, LidardesignError, NumericalError, lacks_memory
-from lidardesign.run.clock import Clock, keep_timings, peak_memory_bytes, running
+from lidardesign.run.clock import Clock, peak_memory_bytes, running
 from lidardesign.run.files import write_atomic
+from lidardesign.run.manifest import keep_timings
 from lidardesign.run.outputs import check_outputs
 
 if TYPE_CHECKING:
@@ -296,6 +297,10 @@ def describe_error(error: BaseException, output: Output) -> tuple[dict[str, Any]
             text = f"{kind}: {further}" if further else kind
             return {"kind": kind, "message": text}, code, text
         cause = cause.__cause__
+    try:
+        os.getcwd()
+    except OSError:  # whatever it was that failed there
+        error = DataError("the working folder no longer exists", hint="change to a folder that does")
     if isinstance(error, LidardesignError):
         return error.as_dict(), error.exit_code, f"{error.kind} error: {error}"
     if lacks_memory(error):
@@ -335,16 +340,16 @@ def _damaged_cache(error: BaseException) -> str | None:
     return None
 
 
-def keep_times(
-    run: Path, name: str, output: Output, *, wait_s: float = SHORT_WAIT_S, further: Mapping[str, Any] | None = None
-) -> None:
-    """Enter the times of a command, and further entries, in the manifest of its run.
+def keep_times(run: Path, name: str, output: Output, *, wait_s: float = SHORT_WAIT_S, **further: Any) -> None:
+    """Enter the times of a command in the manifest of its run; `further` as of `keep_timings`.
 
-    The work is done by then, so a failure to write is a note, not an error.
+    The work is done by then, so a failure to write is a note, not an error; that the run is gone is one.
     """
     try:
-        keep_timings(run, name, output.clock, wait_s=wait_s, further=further)
+        keep_timings(run, name, output.clock, wait_s=wait_s, **further)
     except (ConfigError, DataError, OSError) as error:
+        if "created" in further and isinstance(error, DataError) and not isinstance(error.__cause__, OSError):
+            raise
         message = error.message if isinstance(error, ConfigError | DataError) else error.strerror or error
         output.note(f"note: the times of {name} are not kept in {run}: {message}")
 
@@ -396,10 +401,6 @@ def written_file(path: Path, suffix: str = "") -> Iterator[Path]:
     with tempfile.TemporaryDirectory(prefix="lidardesign-") as folder:
         staged = Path(folder) / f"file{suffix}"
         yield staged
-        if staged.is_dir():
-            raise DataError(
-                "is not a folder, and this is a folder of files", where=str(path), hint="give a folder's name"
-            )
         write_atomic(path, staged.read_bytes())
 
 

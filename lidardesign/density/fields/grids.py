@@ -223,7 +223,6 @@ def _store(path: Path, values: np.ndarray) -> None:
     np.save(buffer, values, allow_pickle=False)
     # a cache that cannot be written costs time, never the result
     with contextlib.suppress(OSError, DataError):
-        path.parent.mkdir(parents=True, exist_ok=True)
         write_atomic(path, buffer.getvalue() + _digest(buffer.getvalue()))
 
 

@@ -23,7 +23,6 @@ import torch
 from lidardesign.config import LearningSettings
 from lidardesign.density.network import DesignFlow
 from lidardesign.errors import DataError
-from lidardesign.run.files import remove_stray_temporaries
 from lidardesign.run.inputs import STATE, check_file, parse_json
 from lidardesign.run.manifest import forget, read_manifest, verify, write_recorded
 
@@ -168,9 +167,5 @@ def stored_snapshots(run: Path) -> dict[int, str]:
 
 
 def clear_snapshots(run: Path, *, beyond: int = 0) -> None:
-    """Remove the snapshots after a step, and what a killed process left of one."""
-    folder = Path(run) / FOLDER
-    if not folder.is_dir():
-        return
-    remove_stray_temporaries(folder)
+    """Remove the snapshots after a step."""
     forget(run, [name for step, name in stored_snapshots(run).items() if step > beyond])
