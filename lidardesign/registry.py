@@ -20,8 +20,8 @@ from importlib.metadata import EntryPoint, distributions, entry_points
 from typing import Any, NoReturn
 
 from lidardesign.errors import ConfigError, DataError, LidardesignError, PluginError, lacks_memory, text_of
-from lidardesign.run.child import START_SECONDS, Child, ChildError
 from lidardesign.run.clock import phase
+from lidardesign.run.processes import START_SECONDS, Child, ChildError
 from lidardesign.task import API_VERSION, Defaults, Metric, Task, TaskConfig
 
 # Environment variable of a probing process, so that a plugin that loads tasks starts no further ones.
@@ -155,7 +155,7 @@ def plugin_guard(name: str) -> Iterator[None]:
     try:
         with _unchanged_process(), contextlib.redirect_stdout(sys.stderr):
             yield
-    except (LidardesignError, KeyboardInterrupt, GeneratorExit, MemoryError):
+    except (LidardesignError, KeyboardInterrupt, MemoryError):
         raise
     except SystemExit as error:
         raise PluginError(f"tried to end the program (exit {error.code})", where=f"task {name}") from error

@@ -107,7 +107,8 @@ def _be_the_program(arguments: Sequence[str], folder: Path, notes: Path, step: i
         _count_steps(notes / COUNTED, step, sent)
         from lidardesign.cli.main import run
 
-        run(list(arguments))
+        sys.argv[1:] = arguments
+        run()
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else 0
     except BaseException:

@@ -20,7 +20,7 @@ from lidardesign import registry
 from lidardesign.config import resolve
 from lidardesign.contract.law import CALL_SECONDS, LOADS, Finding, error_words, place_of, restore_random_states
 from lidardesign.errors import ConfigError, DataError, LidardesignError
-from lidardesign.run.child import START_SECONDS, Child, ChildError, write_line
+from lidardesign.run.processes import START_SECONDS, Child, ChildError, write_line
 
 if TYPE_CHECKING:
     from lidardesign.config import RunConfig

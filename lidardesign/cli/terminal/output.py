@@ -10,7 +10,6 @@ import errno
 import json
 import math
 import os
-import signal
 import sys
 import tempfile
 import traceback
@@ -28,6 +27,7 @@ from lidardesign.errors import BackgroundNote, ConfigError, DataError, Lidardesi
 from lidardesign.run.clock import Clock, keep_timings, peak_memory_bytes, running
 from lidardesign.run.files import write_atomic
 from lidardesign.run.outputs import check_outputs
+from lidardesign.run.processes import DEBUG, ENDING, EXIT_WORDS, exit_code_of, interruption_in
 
 if TYPE_CHECKING:
     from rich.console import Console as RichConsole
@@ -35,12 +35,8 @@ if TYPE_CHECKING:
 SCHEMA_VERSION = 1
 EXIT_SYSTEM = 3
 EXIT_INTERNAL = 70
-EXIT_INTERRUPTED = 130
 EXIT_BROKEN_PIPE = 141
-EXIT_TERMINATED = 143
 PLAIN_WIDTH = 120
-# Where this is set in the environment, errors show their tracebacks.
-DEBUG = "LIDARDESIGN_DEBUG"
 NUMBA_CACHE = "numba/core/caching.py"
 DISK_FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
 STDOUT, STDERR = 1, 2
@@ -225,7 +221,7 @@ def command(*, json: bool, quiet: bool, verbose: bool = False) -> Iterator[Outpu
     except BrokenPipeError:
         forget_stdout()
         raise typer.Exit(EXIT_BROKEN_PIPE) from None
-    except (Exception, KeyboardInterrupt) as error:
+    except BaseException as error:
         code = report_error(error, output)
         try:
             output.stream.flush()
@@ -275,6 +271,7 @@ def forget_stdout() -> None:
 
 def report_error(error: BaseException, output: Output) -> int:
     """Print what went wrong, once, and return the exit code."""
+    ENDING.arrived = True
     document, code, text = describe_error(error, output)
     if output.json and not output.answered:
         print_json({"error": document, "exit_code": code}, output.stream)
@@ -286,18 +283,16 @@ def report_error(error: BaseException, output: Output) -> int:
 
 def describe_error(error: BaseException, output: Output) -> tuple[dict[str, Any], int, str]:
     """The JSON form of an error, its exit code, and its text for people."""
-    cause: BaseException | None = error
-    while cause is not None:  # compiled kernels that return into an interruption make it a SystemError
-        if isinstance(cause, KeyboardInterrupt):
-            kind, code = "interrupted", EXIT_INTERRUPTED
-            if isinstance(cause, TerminatedError):
-                kind, code = "terminated", EXIT_TERMINATED
-            further = output.when_interrupted()
-            text = f"{kind}: {further}" if further else kind
-            return {"kind": kind, "message": text}, code, text
-        cause = cause.__cause__
+    # compiled kernels that return into an interruption make it a SystemError, and half of a module is an ImportError
+    interruption = interruption_in(error)
+    code = ENDING.signalled or (interruption and exit_code_of(interruption))
+    # what could not be written while tidying up is lost, and must be told
+    if code and not isinstance(error, DataError):
+        kind, further = EXIT_WORDS[code], output.when_interrupted()
+        text = f"{kind}: {further}" if further else kind
+        return {"kind": kind, "message": text}, code, text
     if isinstance(error, LidardesignError):
-        return error.as_dict(), error.exit_code, f"{error.kind} error: {error}"
+        return error.as_dict(), code or error.exit_code, f"{error.kind} error: {error}"
     if lacks_memory(error):
         text = "the computer ran out of memory; a smaller batch, field_resolution or preset needs less"
         return {"kind": "memory", "message": text}, NumericalError.exit_code, f"memory error: {text}"
@@ -349,10 +344,6 @@ def keep_times(
         output.note(f"note: the times of {name} are not kept in {run}: {message}")
 
 
-class TerminatedError(KeyboardInterrupt):
-    """SIGTERM, treated like an interruption where things are tidied up."""
-
-
 def set_thread_defaults() -> None:
     """One thread per numerical library unless the user chose otherwise."""
     for name, value in THREAD_DEFAULTS.items():
@@ -371,16 +362,6 @@ def make_streams_tolerant() -> None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 - lives as long as the process
         with contextlib.suppress(AttributeError, ValueError):
             getattr(sys, name).reconfigure(errors="backslashreplace")
-
-
-def terminate_cleanly() -> None:
-    """Let SIGTERM end the program as Ctrl-C does, so that checkpoints and locks are tidied up."""
-
-    def interrupt(*_: Any) -> None:
-        raise TerminatedError
-
-    with contextlib.suppress(ValueError):
-        signal.signal(signal.SIGTERM, interrupt)
 
 
 @contextlib.contextmanager
