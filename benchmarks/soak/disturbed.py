@@ -56,9 +56,9 @@ class Ended:
 
 def import_all() -> None:
     """Import what commands import, so that forks begin with it."""
-    from lidardesign.cli.terminal.output import set_thread_defaults
+    from lidardesign.cli.terminal.output import set_defaults
 
-    set_thread_defaults()
+    set_defaults()
     for name in LATE:
         importlib.import_module(name)
 

@@ -217,7 +217,8 @@ def signalled(straight: Straight, sent: str, name: str, number: int, place: Path
         said, _ = process.communicate()
     took_s, code = time.monotonic() - began, process.returncode
     faults = []
-    if met and (code not in ENDS[sent] or took_s > LONGEST_END_S or "Traceback" in said):
+    # Python itself has a traceback for an interruption before the first line
+    if met and (code not in ENDS[sent] or took_s > LONGEST_END_S or (code > 0 and "Traceback" in said)):
         faults.append(f"{name}, {sent} after {after_s:.3f} s: exit code {code} {took_s:.1f} s later: {said[-300:]}")
     if (place / "signalled" / "run").exists():
         faults += [

@@ -31,7 +31,7 @@ from lidardesign.cli.terminal.output import (
     print_json,
     print_message,
     report_error,
-    set_thread_defaults,
+    set_defaults,
 )
 from lidardesign.errors import page
 from lidardesign.run.processes import ENDING
@@ -165,7 +165,7 @@ def program(
 
 def run(arguments: list[str] | None = None) -> None:
     """Run the program on command line arguments and exit; where a shell asks what to complete, answer it."""
-    set_thread_defaults()
+    set_defaults()
     if COMPLETION in os.environ:
         with contextlib.suppress(Exception):  # nobody can be told at a prompt
             app(prog_name=PROGRAM)

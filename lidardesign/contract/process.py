@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 from lidardesign import registry
 from lidardesign.config import resolve
 from lidardesign.contract.law import CALL_SECONDS, LOADS, Finding, error_words, place_of, restore_random_states
-from lidardesign.errors import ConfigError, DataError, LidardesignError
+from lidardesign.errors import ConfigError, DataError, LidardesignError, text_of
 from lidardesign.run.processes import START_SECONDS, Child, ChildError, write_line
 
 if TYPE_CHECKING:
@@ -178,7 +178,7 @@ def _begin(request: dict[str, Any], result: BinaryIO) -> Contract | None:
             write_line(result, {"refused": error.as_dict()})
         return None
     except BaseException as error:
-        write_line(result, Finding(*LOADS, "fail", f"{type(error).__name__}: {error}").as_dict())
+        write_line(result, Finding(*LOADS, "fail", f"{type(error).__name__}: {text_of(error)}").as_dict())
         return None
     # imported late: a plugin that fails to load is reported without the libraries that the laws need
     from lidardesign.contract.contract import Contract

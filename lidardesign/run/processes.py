@@ -28,6 +28,7 @@ from lidardesign.run.files import write_atomic
 
 EXIT_WORDS = {130: "interrupted", 143: "terminated"}
 EXIT_CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}
+EXIT_INTERNAL = 70
 # Between a signal that was swallowed and its repetition; for tidying up after it, or for what a plugin left behind; and
 # for a file that is being written then [s].
 AGAIN_S, END_S, WRITING_S = 0.25, 3.0, 60.0
@@ -59,7 +60,7 @@ class Ending:
     """
 
     def __init__(self) -> None:
-        self.code, self.signalled, self.arrived, self._listens = 0, 0, False, False
+        self.code, self.signalled, self.arrived, self._listens = EXIT_INTERNAL, 0, False, False
         self._exit, self._tell = os._exit, print
 
     def begin(self, tell: Callable[[str], None]) -> None:
@@ -79,6 +80,8 @@ class Ending:
 
     def end(self, code: int) -> NoReturn:
         """End the process, and what a plugin left running after a while."""
+        if self.signalled and not self.arrived:
+            self._tell(EXIT_WORDS[self.signalled])
         self.code, self.arrived = code, True
         if self._listens:
             _thread.start_new_thread(self._leave, (END_S,))
@@ -103,9 +106,11 @@ class Ending:
     def _leave(self, after_s: float = 0.0) -> None:
         """End the process after a while, unless it has ended by then; a file is written to its end before."""
         time.sleep(after_s)
-        last, main = time.monotonic() + WRITING_S, threading.main_thread().ident
+        last = time.monotonic() + WRITING_S
         while time.monotonic() < last and any(
-            frame.f_code is write_atomic.__code__ for frame, _ in traceback.walk_stack(sys._current_frames().get(main))
+            frame.f_code is write_atomic.__code__
+            for innermost in sys._current_frames().values()
+            for frame, _ in traceback.walk_stack(innermost)
         ):
             time.sleep(AGAIN_S)
         self._exit(self.signalled or self.code)

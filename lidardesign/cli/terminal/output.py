@@ -10,6 +10,7 @@ import errno
 import json
 import math
 import os
+import re
 import sys
 import tempfile
 import traceback
@@ -23,18 +24,27 @@ import typer
 
 from lidardesign.cli.terminal.grids import ProgressDisplay, duration
 from lidardesign.cli.terminal.score_tables import show_times
-from lidardesign.errors import BackgroundNote, ConfigError, DataError, LidardesignError, NumericalError, lacks_memory
+from lidardesign.errors import (
+    LONGEST_TEXT,
+    BackgroundNote,
+    ConfigError,
+    DataError,
+    LidardesignError,
+    NumericalError,
+    lacks_memory,
+    shown,
+    text_of,
+)
 from lidardesign.run.clock import Clock, keep_timings, peak_memory_bytes, running
 from lidardesign.run.files import write_atomic
 from lidardesign.run.outputs import check_outputs
-from lidardesign.run.processes import DEBUG, ENDING, EXIT_WORDS, exit_code_of, interruption_in
+from lidardesign.run.processes import DEBUG, ENDING, EXIT_INTERNAL, EXIT_WORDS, exit_code_of, interruption_in
 
 if TYPE_CHECKING:
     from rich.console import Console as RichConsole
 
 SCHEMA_VERSION = 1
 EXIT_SYSTEM = 3
-EXIT_INTERNAL = 70
 EXIT_BROKEN_PIPE = 141
 PLAIN_WIDTH = 120
 NUMBA_CACHE = "numba/core/caching.py"
@@ -49,6 +59,12 @@ THREAD_DEFAULTS = {
     "OPENBLAS_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
     "OMP_WAIT_POLICY": "PASSIVE",
+}
+# Numbers in the environment that libraries fail on if they are none, or too small for a table.
+NUMBERS = {
+    "COLUMNS": "[2-9][0-9]|[1-9][0-9]{2,3}",
+    "LINES": "[1-9][0-9]{0,3}",
+    "NUMBA_NUM_THREADS": "[1-9][0-9]{0,3}",
 }
 PAGE_SUFFIXES = (".html", ".htm")  # of reports
 
@@ -94,9 +110,13 @@ class Output:
         """A rich console; it honours NO_COLOR, prints plain text where there is no terminal, and text as it is."""
         from rich.console import Console as RichConsole
 
+        class Console(RichConsole):
+            def render_str(self, text: str, **options: Any) -> Any:
+                return super().render_str(shown(text, LONGEST_TEXT), **options)
+
         file = sys.stderr if stderr else self.stream
         width = None if file.isatty() or "COLUMNS" in os.environ else PLAIN_WIDTH
-        return RichConsole(file=file, highlight=False, markup=False, width=width)
+        return Console(file=file, highlight=False, markup=False, width=width)
 
     def note(self, text: str) -> None:
         """Print a note on stderr, unless --quiet."""
@@ -190,7 +210,7 @@ class Output:
 def print_message(text: str) -> None:
     """Print on stderr; a closed stderr is replaced by the null device."""
     try:
-        print(text, file=sys.stderr, flush=True)
+        print(shown(text, LONGEST_TEXT), file=sys.stderr, flush=True)
     except (OSError, ValueError):
         sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - lives as long as the process
 
@@ -310,7 +330,7 @@ def describe_error(error: BaseException, output: Output) -> tuple[dict[str, Any]
             "hint": "remove its files *.nbi and *.nbc",
         }
     else:
-        text = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        text = f"{type(error).__name__}: {text_of(error)}"
         hint = "this is a bug in lidardesign: please report it; LIDARDESIGN_DEBUG=1 shows where"
         document = {"kind": "internal", "message": text, "hint": hint}
         return document, EXIT_INTERNAL, f"internal error: {text}\n  {hint}"
@@ -344,10 +364,13 @@ def keep_times(
         output.note(f"note: the times of {name} are not kept in {run}: {message}")
 
 
-def set_thread_defaults() -> None:
-    """One thread per numerical library unless the user chose otherwise."""
+def set_defaults() -> None:
+    """One thread per numerical library unless the user chose otherwise; other numbers than these must be some."""
     for name, value in THREAD_DEFAULTS.items():
         os.environ.setdefault(name, value)
+    for name, allowed in NUMBERS.items():
+        if not re.fullmatch(allowed, os.environ.get(name, "")):
+            os.environ.pop(name, None)
 
 
 def make_streams_tolerant() -> None:
