@@ -14,6 +14,7 @@ import sys
 from collections.abc import Callable, Sequence
 from numbers import Integral, Real
 from pathlib import Path
+from shlex import quote
 from typing import ParamSpec, TypeVar
 
 # Longest part of a message, which may quote files and options; and of what is printed at once.
@@ -65,9 +66,9 @@ class LidardesignError(Exception):
     def __init__(
         self, message: str, *, where: str | None = None, allowed: str | None = None, hint: str | None = None
     ) -> None:
-        self.message, self.allowed, self.hint = shown(message), shown(allowed), shown(hint)
+        self.message, self.allowed, self.hint = shown_text(message), shown_text(allowed), shown_text(hint)
         # names of files may have line feeds
-        self.where = shown(where and where.replace("\n", "\\n"))
+        self.where = shown_text(where and where.replace("\n", "\\n"))
         super().__init__(message)
 
     def __str__(self) -> str:
@@ -90,7 +91,7 @@ class LidardesignError(Exception):
         return {"kind": self.kind, "message": self.message, **{k: v for k, v in fields.items() if v}}
 
 
-def shown(text: Text, longest: int = LONGEST_PART) -> Text:
+def shown_text(text: Text, longest: int = LONGEST_PART) -> Text:
     """Text of others as it is shown: what terminals obey is escaped, and the middle of a long one left out."""
     if text is None:
         return None
@@ -190,10 +191,16 @@ class ThresholdError(LidardesignError):
     exit_code, kind = 1, "threshold"
 
 
+def pasted(value: object) -> str:
+    """A path or a value as a command line in a message has it: quoted for the shell, and never an option."""
+    text = str(value)
+    return quote(f"./{text}" if text.startswith("-") else text)
+
+
 def text_of(error: BaseException) -> str:
     """Message of an error in one line, even if its class fails to make one."""
     try:
-        return " ".join(shown(str(error)).split()) or "no message"
+        return " ".join(shown_text(str(error)).split()) or "no message"
     except BaseException:  # whatever it does there
         return "no message"
 

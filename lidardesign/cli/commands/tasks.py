@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from shlex import quote
 from typing import Annotated, Any
 
 import typer
@@ -12,6 +11,7 @@ import typer
 from lidardesign.cli.terminal import options
 from lidardesign.cli.terminal.grids import RichConsole, text_table
 from lidardesign.cli.terminal.output import command
+from lidardesign.errors import pasted
 from lidardesign.run.clock import phase
 
 OUTCOMES = {"pass": ("pass", "green"), "fail": ("FAIL", "bold red"), "skip": ("skip", "dim")}
@@ -188,7 +188,7 @@ def new(
         def show_files(rich: RichConsole) -> None:
             for path in written:
                 rich.print(f"  {path}")
-            advice = f"next: pip install --editable {quote(f'{folder}[test]')}, then lidardesign tasks check {name}"
+            advice = f"next: pip install --editable {pasted(f'{folder}[test]')}, then lidardesign tasks check {name}"
             rich.print(advice, soft_wrap=True)
 
         output.result({"task": name, "folder": folder, "files": written}, show_files, show_costs=False)

@@ -17,7 +17,6 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from shlex import quote
 from typing import TYPE_CHECKING, Any, TextIO
 
 import typer
@@ -32,7 +31,8 @@ from lidardesign.errors import (
     LidardesignError,
     NumericalError,
     lacks_memory,
-    shown,
+    pasted,
+    shown_text,
     text_of,
 )
 from lidardesign.run.clock import Clock, keep_timings, peak_memory_bytes, running
@@ -112,7 +112,7 @@ class Output:
 
         class Console(RichConsole):
             def render_str(self, text: str, **options: Any) -> Any:
-                return super().render_str(shown(text, LONGEST_TEXT), **options)
+                return super().render_str(shown_text(text, LONGEST_TEXT), **options)
 
         file = sys.stderr if stderr else self.stream
         width = None if file.isatty() or "COLUMNS" in os.environ else PLAIN_WIDTH
@@ -210,7 +210,7 @@ class Output:
 def print_message(text: str) -> None:
     """Print on stderr; a closed stderr is replaced by the null device."""
     try:
-        print(shown(text, LONGEST_TEXT), file=sys.stderr, flush=True)
+        print(shown_text(text, LONGEST_TEXT), file=sys.stderr, flush=True)
     except (OSError, ValueError):
         sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - lives as long as the process
 
@@ -422,7 +422,7 @@ def claim_outputs(output: Output, *, csv: Path | None = None, report: Path | Non
             f"{report.name} is not the name of an HTML page",
             where="--report",
             allowed=", ".join(PAGE_SUFFIXES),
-            hint=f"--report {quote(str(report.with_suffix('.html')))}; a browser prints it as PDF",
+            hint=f"--report {pasted(report.with_suffix('.html'))}; a browser prints it as PDF",
         )
     announce([path for path in (csv, report) if path is not None], output)
 
