@@ -66,9 +66,9 @@ class LidardesignError(Exception):
     def __init__(
         self, message: str, *, where: str | None = None, allowed: str | None = None, hint: str | None = None
     ) -> None:
-        self.message, self.allowed, self.hint = shown_text(message), shown_text(allowed), shown_text(hint)
+        self.message, self.allowed, self.hint = escaped(message), escaped(allowed), escaped(hint)
         # names of files may have line feeds
-        self.where = shown_text(where and where.replace("\n", "\\n"))
+        self.where = escaped(where and where.replace("\n", "\\n"))
         super().__init__(message)
 
     def __str__(self) -> str:
@@ -91,7 +91,7 @@ class LidardesignError(Exception):
         return {"kind": self.kind, "message": self.message, **{k: v for k, v in fields.items() if v}}
 
 
-def shown_text(text: Text, longest: int = LONGEST_PART) -> Text:
+def escaped(text: Text, longest: int = LONGEST_PART) -> Text:
     """Text of others as it is shown: what terminals obey is escaped, and the middle of a long one left out."""
     if text is None:
         return None
@@ -200,7 +200,7 @@ def pasted(value: object) -> str:
 def text_of(error: BaseException) -> str:
     """Message of an error in one line, even if its class fails to make one."""
     try:
-        return " ".join(shown_text(str(error)).split()) or "no message"
+        return " ".join(escaped(str(error)).split()) or "no message"
     except BaseException:  # whatever it does there
         return "no message"
 

@@ -201,8 +201,6 @@ def _invoke(arguments: list[str]) -> int:
         code: Any = app(arguments, prog_name=PROGRAM, standalone_mode=False)
     except typer.Exit as error:
         code = error.exit_code
-    except typer.Abort:  # a signal came before any command had begun
-        return report_error(KeyboardInterrupt(), output)
     except SystemExit as error:
         # typer ends like this once completion is shown or installed, rich where nobody reads any more
         if error.code:

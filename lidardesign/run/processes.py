@@ -92,7 +92,7 @@ class Ending:
             self.signalled = EXIT_CODES[number]
             # threading has locks, and the main thread may hold them
             _thread.start_new_thread(self._insist, (number,))
-        if not self.arrived and not interruption_in(sys.exception()):
+        if not self.arrived and not code_of_interruption(sys.exception()):
             raise TerminatedError if number == signal.SIGTERM else KeyboardInterrupt
 
     def _insist(self, number: int) -> None:
@@ -124,18 +124,15 @@ class Ending:
 ENDING = Ending()
 
 
-def interruption_in(error: BaseException | None) -> KeyboardInterrupt | None:
-    """The interruption that an error is, comes from or was raised in; None without one."""
+def code_of_interruption(error: BaseException | None) -> int:
+    """The exit code of the interruption that an error is, comes from or was raised in; 0 without one."""
     met: set[int] = set()
-    while error is not None and not isinstance(error, KeyboardInterrupt) and id(error) not in met:
+    while error is not None and id(error) not in met:
+        if isinstance(error, KeyboardInterrupt):
+            return EXIT_CODES[signal.SIGTERM if isinstance(error, TerminatedError) else signal.SIGINT]
         met.add(id(error))
         error = error.__cause__ or error.__context__
-    return error if isinstance(error, KeyboardInterrupt) else None
-
-
-def exit_code_of(interruption: KeyboardInterrupt) -> int:
-    """The exit code of an interruption."""
-    return EXIT_CODES[signal.SIGTERM if isinstance(interruption, TerminatedError) else signal.SIGINT]
+    return 0
 
 
 class ChildError(Exception):

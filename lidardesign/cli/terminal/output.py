@@ -30,15 +30,15 @@ from lidardesign.errors import (
     DataError,
     LidardesignError,
     NumericalError,
+    escaped,
     lacks_memory,
     pasted,
-    shown_text,
     text_of,
 )
 from lidardesign.run.clock import Clock, keep_timings, peak_memory_bytes, running
 from lidardesign.run.files import write_atomic
 from lidardesign.run.outputs import check_outputs
-from lidardesign.run.processes import DEBUG, ENDING, EXIT_INTERNAL, EXIT_WORDS, exit_code_of, interruption_in
+from lidardesign.run.processes import DEBUG, ENDING, EXIT_INTERNAL, EXIT_WORDS, code_of_interruption
 
 if TYPE_CHECKING:
     from rich.console import Console as RichConsole
@@ -112,7 +112,7 @@ class Output:
 
         class Console(RichConsole):
             def render_str(self, text: str, **options: Any) -> Any:
-                return super().render_str(shown_text(text, LONGEST_TEXT), **options)
+                return super().render_str(escaped(text, LONGEST_TEXT), **options)
 
         file = sys.stderr if stderr else self.stream
         width = None if file.isatty() or "COLUMNS" in os.environ else PLAIN_WIDTH
@@ -210,7 +210,7 @@ class Output:
 def print_message(text: str) -> None:
     """Print on stderr; a closed stderr is replaced by the null device."""
     try:
-        print(shown_text(text, LONGEST_TEXT), file=sys.stderr, flush=True)
+        print(escaped(text, LONGEST_TEXT), file=sys.stderr, flush=True)
     except (OSError, ValueError):
         sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - lives as long as the process
 
@@ -304,8 +304,7 @@ def report_error(error: BaseException, output: Output) -> int:
 def describe_error(error: BaseException, output: Output) -> tuple[dict[str, Any], int, str]:
     """The JSON form of an error, its exit code, and its text for people."""
     # compiled kernels that return into an interruption make it a SystemError, and half of a module is an ImportError
-    interruption = interruption_in(error)
-    code = ENDING.signalled or (interruption and exit_code_of(interruption))
+    code = ENDING.signalled or code_of_interruption(error)
     # what could not be written while tidying up is lost, and must be told
     if code and not isinstance(error, DataError):
         kind, further = EXIT_WORDS[code], output.when_interrupted()
@@ -340,9 +339,7 @@ def describe_error(error: BaseException, output: Output) -> tuple[dict[str, Any]
 
 def _damaged_cache(error: BaseException) -> str | None:
     """The folder of numba's cache where an error came from reading a damaged file in it; else None."""
-    trace = error.__traceback__
-    while trace is not None:
-        frame, trace = trace.tb_frame, trace.tb_next
+    for frame, _ in traceback.walk_tb(error.__traceback__):
         if frame.f_code.co_filename.replace(os.sep, "/").endswith(NUMBA_CACHE):
             folder = getattr(frame.f_locals.get("self"), "_cache_path", None)
             if folder is not None:
