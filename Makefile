@@ -126,9 +126,9 @@ soak-seeds: $(BIN)/.test
 	$(LONG) benchmarks/soak/seeds.py --amount $(or $(AMOUNT),20)
 
 # Learning, fitting and evaluating are killed at all steps and random moments: what is left can be read, and going on
-# repeats the bytes. Processes are forked, which workers with threads cannot do.
+# repeats the bytes; and every command ends with its signals. Processes are forked, which workers with threads cannot do.
 soak-kills: $(BIN)/.test
-	$(LONG) -n 0 benchmarks/soak/kills.py --amount $(or $(AMOUNT),1650)
+	$(LONG) -n 0 benchmarks/soak/kills.py --amount $(or $(AMOUNT),2300)
 
 # 2,000 random plans: nothing that is skipped changes more than is tolerated
 soak-promise: $(BIN)/.test

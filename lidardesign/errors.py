@@ -14,10 +14,13 @@ import sys
 from collections.abc import Callable, Sequence
 from numbers import Integral, Real
 from pathlib import Path
+from shlex import quote
 from typing import ParamSpec, TypeVar
 
-# Longest part of a message, which may quote files and options.
-LONGEST_PART = 1500
+# Longest part of a message, which may quote files and options; and of what is printed at once.
+LONGEST_PART, LONGEST_TEXT = 1500, 20_000
+# What a terminal does not show but obeys: control characters but tabs and line feeds, and directions of writing.
+OBEYED = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]")
 Text = TypeVar("Text", str, None)
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
@@ -63,7 +66,9 @@ class LidardesignError(Exception):
     def __init__(
         self, message: str, *, where: str | None = None, allowed: str | None = None, hint: str | None = None
     ) -> None:
-        self.message, self.where, self.allowed, self.hint = _short(message), _short(where), _short(allowed), hint
+        self.message, self.allowed, self.hint = escaped(message), escaped(allowed), escaped(hint)
+        # names of files may have line feeds
+        self.where = escaped(where and where.replace("\n", "\\n"))
         super().__init__(message)
 
     def __str__(self) -> str:
@@ -86,11 +91,13 @@ class LidardesignError(Exception):
         return {"kind": self.kind, "message": self.message, **{k: v for k, v in fields.items() if v}}
 
 
-def _short(text: Text) -> Text:
-    if text is None or len(text) <= LONGEST_PART:
-        return text
-    half = LONGEST_PART // 2
-    return f"{text[:half]} ... {text[-half:]}"
+def escaped(text: Text, longest: int = LONGEST_PART) -> Text:
+    """Text of others as it is shown: what terminals obey is escaped, and the middle of a long one left out."""
+    if text is None:
+        return None
+    half = longest // 2
+    text = text if len(text) <= longest else f"{text[:half]} ... {text[-half:]}"
+    return OBEYED.sub(lambda found: ascii(found[0])[1:-1], text)
 
 
 def _as_argument(text: Text) -> Text:
@@ -184,11 +191,17 @@ class ThresholdError(LidardesignError):
     exit_code, kind = 1, "threshold"
 
 
+def pasted(value: object) -> str:
+    """A path or a value as a command line in a message has it: quoted for the shell, and never an option."""
+    text = str(value)
+    return quote(f"./{text}" if text.startswith("-") else text)
+
+
 def text_of(error: BaseException) -> str:
     """Message of an error in one line, even if its class fails to make one."""
     try:
-        return " ".join(str(error).split()) or "no message"
-    except Exception:
+        return " ".join(escaped(str(error)).split()) or "no message"
+    except BaseException:  # whatever it does there
         return "no message"
 
 

@@ -11,17 +11,15 @@ import difflib
 import faulthandler
 import functools
 import os
-import signal
 import sys
-import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, distributions, entry_points
 from typing import Any, NoReturn
 
 from lidardesign.errors import ConfigError, DataError, LidardesignError, PluginError, lacks_memory, text_of
-from lidardesign.run.child import START_SECONDS, Child, ChildError
 from lidardesign.run.clock import phase
+from lidardesign.run.processes import START_SECONDS, Child, ChildError
 from lidardesign.task import API_VERSION, Defaults, Metric, Task, TaskConfig
 
 # Environment variable of a probing process, so that a plugin that loads tasks starts no further ones.
@@ -155,7 +153,7 @@ def plugin_guard(name: str) -> Iterator[None]:
     try:
         with _unchanged_process(), contextlib.redirect_stdout(sys.stderr):
             yield
-    except (LidardesignError, KeyboardInterrupt, GeneratorExit, MemoryError):
+    except (LidardesignError, KeyboardInterrupt, MemoryError):
         raise
     except SystemExit as error:
         raise PluginError(f"tried to end the program (exit {error.code})", where=f"task {name}") from error
@@ -230,7 +228,7 @@ def _load(name: str, offers: list[EntryPoint]) -> Task:
     offer = _unique_entry_point(name, offers)
     if _is_foreign(offer):
         _check_containable(name, offer.value, tuple(sys.path))
-    return import_task(offer, IMPORT_SECONDS)
+    return import_task(offer)
 
 
 def _unique_entry_point(name: str, offers: list[EntryPoint]) -> EntryPoint:
@@ -240,13 +238,13 @@ def _unique_entry_point(name: str, offers: list[EntryPoint]) -> EntryPoint:
     return offers[0]
 
 
-def import_task(offer: EntryPoint, seconds: float) -> Task:
+def import_task(offer: EntryPoint) -> Task:
     """Import the task of an entry point in this process.
 
     Raises:
-        PluginError: It cannot be loaded in time, or breaks the contract.
+        PluginError: It cannot be loaded, or breaks the contract.
     """
-    with plugin_guard(offer.name), _time_limit(offer.name, seconds):
+    with plugin_guard(offer.name):
         plugin = offer.load()
         task = plugin() if callable(plugin) else plugin
         check_interface(offer.name, task)
@@ -297,30 +295,9 @@ def answer_probe(request: dict[str, Any], _: object) -> dict[str, Any]:
     faulthandler.dump_traceback_later(request["seconds"] + START_SECONDS, exit=True)
     offer = EntryPoint(request["name"], request["value"], GROUP)
     try:
-        return {"summary": import_task(offer, request["seconds"]).summary}
-    except PluginError as error:
-        return {"error": error.message}
+        return {"summary": import_task(offer).summary}
     except BaseException as error:
-        return {"error": f"{type(error).__name__}: {text_of(error)}"}
-
-
-@contextlib.contextmanager
-def _time_limit(name: str, seconds: float) -> Iterator[None]:
-    """Interrupt an import that hangs; only where the system can (POSIX signals, main thread)."""
-    if not hasattr(signal, "setitimer") or threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def interrupt(*_: Any) -> None:
-        raise PluginError(f"was not imported within {seconds:g} s", where=f"task {name}", hint=AUTHOR_HINT)
-
-    previous = signal.signal(signal.SIGALRM, interrupt)
-    signal.setitimer(signal.ITIMER_REAL, seconds)
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, previous)
+        return {"error": getattr(error, "message", None) or f"{type(error).__name__}: {text_of(error)}"}
 
 
 def check_interface(name: str, task: Any) -> None:

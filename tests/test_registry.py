@@ -83,6 +83,13 @@ def test_the_guard_turns_what_a_plugin_raises_into_a_plugin_error():
         _ = 1 / 0
     with pytest.raises(ConfigError, match="mine"), plugin_guard("good"):
         raise ConfigError("mine")
+    told_by_nothing = type("Odd", (Exception,), {"__str__": lambda self: sys.exit(0)})
+    for error in (GeneratorExit, BaseExceptionGroup("all", [KeyboardInterrupt()]), StopIteration, told_by_nothing):
+        with (
+            pytest.raises(PluginError, match=r"GeneratorExit|Group|StopIteration|Odd: no message"),
+            plugin_guard("good"),
+        ):
+            raise error
     with pytest.raises(KeyboardInterrupt), plugin_guard("good"):
         raise KeyboardInterrupt
     for lost in (MemoryError(), OSError(errno.ENOMEM, "no"), ImportError("lib.so: failed to map segment from object")):

@@ -57,9 +57,9 @@ class Ended:
 
 def import_all() -> None:
     """Import what commands import, so that forks begin with it."""
-    from lidardesign.cli.terminal.output import set_thread_defaults
+    from lidardesign.cli.terminal.output import set_defaults
 
-    set_thread_defaults()
+    set_defaults()
     for name in LATE:
         importlib.import_module(name)
 
@@ -108,7 +108,8 @@ def _be_the_program(arguments: Sequence[str], folder: Path, notes: Path, step: i
         _count_steps(notes / COUNTED, step, sent)
         from lidardesign.cli.main import run
 
-        run(list(arguments))
+        sys.argv[1:] = arguments
+        run()
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else 0
     except BaseException:

@@ -6,14 +6,20 @@ no temporary file, and the bytes of flow, samples, snapshots, checkpoint, design
 nobody disturbed, but for the seconds in them. A folder of several files must be the old or the new one, or name what is
 unfinished, and be the new one once the command is given again. Of two commands at once in one folder one must work, and
 the other must work or be told why not.
+
+Any command, as a program of its own, ends with 130 or 143 within 5 s of a SIGINT or SIGTERM at any time.
 """
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import itertools
+import os
 import shutil
 import signal
+import subprocess
+import sys
 import time
 import zlib
 from collections import Counter
@@ -26,7 +32,9 @@ from trimesh.creation import box
 
 from benchmarks.soak.disturbed import (
     COMMANDS,
+    EVALUATE,
     FINISHED,
+    FIT,
     LEARN,
     Ended,
     Fork,
@@ -60,6 +68,25 @@ SETS = {
     "tasks new here": ["tasks", "new", "landmark", "--quiet", "--out", "."],
 }
 PARTS = {"old": "vl53l8cx", "new": "tmf8828"}
+WORKERS = ["--workers", "2"]
+# Programs that are sent signals: where a command of this name is given, and what is given.
+PROGRAMS = {
+    "learn": ("learn", LEARN),
+    "fit": ("fit", FIT),
+    "fit --workers": ("fit", [*FIT, *WORKERS]),
+    "constrain": ("evaluate", ["constrain", "run", "--set", "gate.width_m.max=0.5"]),
+    "evaluate": ("evaluate", EVALUATE),
+    "evaluate --workers": ("evaluate", [*EVALUATE, *WORKERS]),
+    "export": ("evaluate", ["export", "run/designs/fit.yaml", "--format", "npz", "--out", "rays.npz"]),
+    "simulate": ("evaluate", ["simulate", "run", "--scenes", "2", "--out", "clouds"]),
+    "show": ("evaluate", ["show", "run", "--json"]),
+    "studio": ("evaluate", ["studio", "run", "--no-browser"]),
+    "catalog": ("learn", ["catalog", "list"]),
+    "tasks": ("learn", ["tasks", "check", "flatland"]),
+}
+LONGEST_PROGRAM_S, LONGEST_END_S = 6.0, 5.0
+# Death by the signal itself, before the first line of the program, counts.
+ENDS = {"SIGINT": (130, -signal.SIGINT), "SIGTERM": (143, -signal.SIGTERM)}
 REFUSED = (2, 3)
 LONGEST_DELAY_S = 2.0
 TERMINATED = 143
@@ -70,6 +97,7 @@ ROUND = [
     *((*way, name) for turn in range(10) for way in WAYS for name, turns in TURNS[way[0]].items() if turn < turns),
     *(("pair", "", name) for name in PAIRS),
     *(("set", "SIGKILL", name) for name in SETS),
+    *(("program", sent, name) for name in PROGRAMS for sent in ENDS),
 ]
 
 
@@ -96,6 +124,8 @@ def test_what_is_disturbed_recovers(tmp_path, piece, straight, where, sent, name
             met, told, faults = set_killed(name, number, tmp_path)
         elif where == "pair":
             met, told, faults = at_once(straight(), name, number, tmp_path / "both")
+        elif where == "program":
+            return signalled(straight(), sent, name, number, tmp_path)
         else:
             met, told, faults = ended_early(straight(), where, sent, name, number, tmp_path / "killed")
         faults = [f"{name}, {told}: {fault}" for fault in faults]
@@ -212,3 +242,47 @@ def at_once(straight: Straight, name: str, number: int, place: Path) -> tuple[bo
     faults += [f"{file} differs" for file in found if file in whole and found[file] != whole[file]]
     shutil.rmtree(place)
     return all(end.code == 0 for end in ends), f"{delay_s:.3f} s apart", faults
+
+
+@functools.cache
+def seconds_of(straight: Straight, name: str, place: Path) -> float:
+    """How long a program takes, undisturbed; the page of the studio never ends."""
+    straight.before(PROGRAMS[name][0], place)
+    command, began = [sys.executable, "-m", "lidardesign", *PROGRAMS[name][1]], time.monotonic()
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        subprocess.run(command, cwd=place, capture_output=True, check=False, timeout=LONGEST_PROGRAM_S)
+    return time.monotonic() - began
+
+
+def signalled(straight: Straight, sent: str, name: str, number: int, place: Path) -> dict[str, object]:
+    """Send a program a signal at a random time, SIGINT to all of its processes, as terminals do."""
+    seconds = seconds_of(straight, name, place / "before")
+    after_s = np.random.default_rng([zlib.crc32(f"program {sent} {name}".encode()), number]).uniform(0, seconds)
+    straight.before(PROGRAMS[name][0], place / "signalled")
+    # a suite that runs in the background of a shell hands on that interruptions are ignored
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    with subprocess.Popen(
+        [sys.executable, "-m", "lidardesign", *PROGRAMS[name][1]], cwd=place / "signalled", text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True,
+    ) as process:  # fmt: skip
+        time.sleep(after_s)
+        met, began = process.poll() is None, time.monotonic()
+        if met and sent == "SIGINT":
+            os.killpg(process.pid, signal.SIGINT)
+        elif met:
+            process.terminate()
+        said, _ = process.communicate()
+    took_s, code = time.monotonic() - began, process.returncode
+    faults = []
+    # Python itself has a traceback for an interruption before the first line
+    if met and (code not in ENDS[sent] or took_s > LONGEST_END_S or (code > 0 and "Traceback" in said)):
+        faults.append(f"{name}, {sent} after {after_s:.3f} s: exit code {code} {took_s:.1f} s later: {said[-300:]}")
+    if (place / "signalled" / "run").exists():
+        faults += [
+            f"{name}, {sent} after {after_s:.3f} s: unreadable: {fault}"
+            for fault in unreadable(place / "signalled/run")
+        ]
+    return {
+        "case": f"{name}, {sent} to the program", "counts": {"met at work, or both worked": int(met)},
+        "figures": {"seconds to the end": took_s} if met else {}, "faults": faults,
+    }  # fmt: skip

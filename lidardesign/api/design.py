@@ -9,7 +9,6 @@ import html
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,7 +21,7 @@ from lidardesign.api.export import (
     exporter_of,
 )
 from lidardesign.constraints.document import Constraints
-from lidardesign.errors import ConfigError, DataError, check_number, names_arguments
+from lidardesign.errors import ConfigError, DataError, check_number, names_arguments, pasted
 from lidardesign.fitting.options import FitOptions
 from lidardesign.fitting.request import FitRequest, FitResult
 from lidardesign.formats.designs import need_run, reach_beside, read_design, relative_folder, run_of
@@ -399,7 +398,7 @@ def collect_designs(
         seen.setdefault(id(design) if design.path is None else design.path.resolve(), copy)
     if not seen:
         where = str(runs[0].folder if judge else next(iter(opened)))
-        raise DataError("the run has no designs yet", where=where, hint=f"lidardesign fit {quote(where)}")
+        raise DataError("the run has no designs yet", where=where, hint=f"lidardesign fit {pasted(where)}")
     return list(seen.values())
 
 

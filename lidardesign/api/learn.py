@@ -9,11 +9,18 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 from lidardesign.config import RunConfig, load_run_config, resolve, save_run_config
-from lidardesign.errors import BackgroundNote, ConfigError, DataError, ThresholdError, check_choice, check_number
+from lidardesign.errors import (
+    BackgroundNote,
+    ConfigError,
+    DataError,
+    ThresholdError,
+    check_choice,
+    check_number,
+    pasted,
+)
 from lidardesign.registry import distribution_of, load_task, plugin_guard, task_names
 from lidardesign.run.clock import WAIT_S, Clock, outermost_clock, phase
 from lidardesign.run.files import exchange, is_held, is_temporary, named, remove, run_lock, writer
@@ -52,6 +59,7 @@ TOLERANCES, TIME_BUDGETS_S = (1e-4, 0.9999), (1.0, 366 * 24 * 3600.0)
 STANDARD_ERRORS = 2.0
 # Of a run that ends by the clock; config.yaml has the steps that it took once it has ended.
 MOST_STEPS = 100_000_000
+NO_RUN, NO_RUN_HINT = "there is no run to resume", "leave out --resume to start one"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,7 +156,7 @@ class LearnRequest:
         replaces = options.overwrite and _holds_run(folder)
         place = next_to(folder, NEW) if replaces else folder
         if options.resume and not place.is_dir():
-            raise DataError("there is no run to resume", where=str(place), hint="leave out --resume to start one")
+            raise DataError(NO_RUN, where=str(place), hint=NO_RUN_HINT)
         begun = options.resume and not _was_killed_before_it_began(place)
         if begun:
             plugin, settings = _resumed_settings(plugin, place, choices)
@@ -289,7 +297,7 @@ class LearnRequest:
         checkpoints = sorted(path.name for path in self.place.glob(CHECKPOINTS))
         if not checkpoints:
             return "before the first checkpoint; nothing was kept"
-        again = f"--out {quote(str(self.folder))} {'--overwrite ' if self.replaces else ''}--resume"
+        again = f"--out {pasted(self.folder)} {'--overwrite ' if self.replaces else ''}--resume"
         for option, value in (("--tolerance", self.options.tolerance), ("--time-budget", self.options.time_budget_s)):
             again += "" if value is None else f" {option} {value:g}"
         last = f"the last checkpoint is {self.place / checkpoints[-1]}"
@@ -348,11 +356,14 @@ def _task_named(config_file: Path | None, run: Path | None) -> str:
 
     Raises:
         ConfigError: Neither names one.
+        DataError: There is no such run.
     """
     resumed = () if run is None or not (run / CONFIGURATION).is_file() else (run / CONFIGURATION,)
     files = (*(() if config_file is None else (config_file,)), *resumed)
     named = [load_yaml(file, empty_sections=True).mapping.get("task_name") for file in files]
     if not any(named):
+        if run is not None:
+            raise DataError(NO_RUN, where=str(run), hint=NO_RUN_HINT)
         raise ConfigError(
             "no task was named",
             where="TASK",
@@ -391,7 +402,7 @@ def _holds_run(folder: Path) -> bool:
             hint="give another --out",
         )
     if aside.exists():
-        hint = f"remove it; if {folder} is not there: mv {quote(str(next_to(folder, NEW)))} {quote(str(folder))}"
+        hint = f"remove it; if {folder} is not there: mv {pasted(next_to(folder, NEW))} {pasted(folder)}"
         raise ConfigError("is left over from a replacement that was killed", where=str(aside), hint=hint)
     if not folder.is_dir() or _was_killed_before_it_began(folder):
         return False

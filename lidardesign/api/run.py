@@ -6,13 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
-from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 from lidardesign.api.design import Design, html_table
 from lidardesign.api.learn import LearnOptions, LearnRequest, check_tolerance
 from lidardesign.constraints.document import Constraints
-from lidardesign.errors import ConfigError, DataError, LidardesignError, check_number, names_arguments
+from lidardesign.errors import ConfigError, DataError, LidardesignError, check_number, names_arguments, pasted
 from lidardesign.fitting.options import FitOptions
 from lidardesign.fitting.request import FitRequest
 from lidardesign.formats.designs import folder_of, reach_of, read_design, relative_folder
@@ -286,7 +285,7 @@ class Run(RunFolder):
 
     def _next_commands(self, designs: Sequence[Mapping[str, Any]], finished: bool, metric: Metric) -> list[str]:
         """Command lines of the next steps."""
-        run = quote(str(self.folder))
+        run = pasted(self.folder)
         if not finished:
             return [f"lidardesign learn {self.config.task_name} --out {run} --resume"]
         scored = [entry for entry in designs if entry["score"] is not None]
@@ -299,7 +298,7 @@ class Run(RunFolder):
         return [
             *evaluating,
             f"lidardesign constrain {run} --set budget.rays={max(rays // 2, 1)} --name fewer",
-            f"lidardesign export {quote(best['path'])} --format csv --rays {rays} --out rays.csv",
+            f"lidardesign export {pasted(best['path'])} --format csv --rays {rays} --out rays.csv",
         ]
 
     @names_arguments

@@ -11,12 +11,11 @@ from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import reduce
 from pathlib import Path
-from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 from lidardesign.api.design import Design
 from lidardesign.api.scores import ScoreOptions, ScoreRequest, Scores
-from lidardesign.errors import ConfigError, DataError, names_arguments
+from lidardesign.errors import ConfigError, DataError, names_arguments, pasted
 from lidardesign.formats.designs import read_design
 from lidardesign.run.clock import Progress, outermost_clock, running
 from lidardesign.run_folder import Notes, RunFolder, log_note
@@ -246,7 +245,7 @@ def _common_names(runs: Sequence[RunFolder], wanted: Sequence[str]) -> list[str]
     for run, names in zip(runs, sets, strict=True):
         if not names:
             raise DataError(
-                "the run has no designs yet", where=str(run.folder), hint=f"lidardesign fit {quote(str(run.folder))}"
+                "the run has no designs yet", where=str(run.folder), hint=f"lidardesign fit {pasted(run.folder)}"
             )
     common = sorted(reduce(set.intersection, sets))
     if not common:

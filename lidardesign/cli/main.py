@@ -31,10 +31,10 @@ from lidardesign.cli.terminal.output import (
     print_json,
     print_message,
     report_error,
-    set_thread_defaults,
-    terminate_cleanly,
+    set_defaults,
 )
 from lidardesign.errors import page
+from lidardesign.run.processes import ENDING
 
 PROGRAM = "lidardesign"
 COMPLETION = "_LIDARDESIGN_COMPLETE"
@@ -165,14 +165,15 @@ def program(
 
 def run(arguments: list[str] | None = None) -> None:
     """Run the program on command line arguments and exit; where a shell asks what to complete, answer it."""
-    set_thread_defaults()
+    set_defaults()
     if COMPLETION in os.environ:
         with contextlib.suppress(Exception):  # nobody can be told at a prompt
             app(prog_name=PROGRAM)
         sys.exit(1)
     make_streams_tolerant()
-    terminate_cleanly()
-    arguments = sys.argv[1:] if arguments is None else arguments
+    if arguments is None:
+        ENDING.begin(print_message)
+        arguments = sys.argv[1:]
     try:
         code = _invoke(arguments)
         sys.stdout.flush()
@@ -184,7 +185,7 @@ def run(arguments: list[str] | None = None) -> None:
     except OSError as error:
         forget_stdout()
         code = report_error(error, Output())
-    sys.exit(code)
+    ENDING.end(code)
 
 
 def _invoke(arguments: list[str]) -> int:
@@ -200,9 +201,6 @@ def _invoke(arguments: list[str]) -> int:
         code: Any = app(arguments, prog_name=PROGRAM, standalone_mode=False)
     except typer.Exit as error:
         code = error.exit_code
-    except (typer.Abort, KeyboardInterrupt) as error:
-        # a signal may come before any command has begun
-        return report_error(error if isinstance(error, KeyboardInterrupt) else KeyboardInterrupt(), output)
     except SystemExit as error:
         # typer ends like this once completion is shown or installed, rich where nobody reads any more
         if error.code:
@@ -210,7 +208,7 @@ def _invoke(arguments: list[str]) -> int:
         return 0
     except BrokenPipeError:
         raise
-    except Exception as error:
+    except BaseException as error:
         if not hasattr(error, "format_message"):
             return report_error(error, output)
         # One message for what typer finds wrong with the command line

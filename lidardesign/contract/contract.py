@@ -102,15 +102,10 @@ class Contract:
         started = time.perf_counter()
         try:
             found = law.check(self.subject)
-        except LidardesignError as error:
-            return Finding(*known, "fail", error_words(error), time.perf_counter() - started)
         except Exception as error:  # what a task gives instead of what it should surprises in any way
-            return Finding(
-                *known,
-                "fail",
-                f"{type(error).__name__}: {text_of(error)}{place_of(error)}",
-                time.perf_counter() - started,
-            )
+            is_ours = isinstance(error, LidardesignError)
+            words = error_words(error) if is_ours else f"{type(error).__name__}: {text_of(error)}{place_of(error)}"
+            return Finding(*known, "fail", words, time.perf_counter() - started)
         seconds = time.perf_counter() - started
         if isinstance(found, NotApplicable):
             return Finding(*known, "skip", found.reason, seconds)

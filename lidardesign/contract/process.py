@@ -20,7 +20,7 @@ from lidardesign import registry
 from lidardesign.config import resolve
 from lidardesign.contract.law import CALL_SECONDS, LOADS, Finding, error_words, place_of, restore_random_states
 from lidardesign.errors import ConfigError, DataError, LidardesignError
-from lidardesign.run.child import START_SECONDS, Child, ChildError, write_line
+from lidardesign.run.processes import START_SECONDS, Child, ChildError, write_line
 
 if TYPE_CHECKING:
     from lidardesign.config import RunConfig
@@ -177,9 +177,6 @@ def _begin(request: dict[str, Any], result: BinaryIO) -> Contract | None:
         else:
             write_line(result, {"refused": error.as_dict()})
         return None
-    except BaseException as error:
-        write_line(result, Finding(*LOADS, "fail", f"{type(error).__name__}: {error}").as_dict())
-        return None
     # imported late: a plugin that fails to load is reported without the libraries that the laws need
     from lidardesign.contract.contract import Contract
     from lidardesign.contract.law import Subject
@@ -193,7 +190,7 @@ def _begin(request: dict[str, Any], result: BinaryIO) -> Contract | None:
 def _loaded(request: dict[str, Any], drawn: list[str]) -> tuple[Task, RunConfig]:
     offer = EntryPoint(request["name"], request["value"], registry.GROUP)
     with restore_random_states(drawn, "import"):
-        task = registry.import_task(offer, request["seconds"])
+        task = registry.import_task(offer)
     config_file = Path(request["config_file"]) if request["config_file"] else None
     with restore_random_states(drawn, "space"):
         return task, resolve(

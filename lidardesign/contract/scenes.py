@@ -30,7 +30,7 @@ from lidardesign.contract.law import (
 from lidardesign.errors import ConfigError, LidardesignError
 from lidardesign.rays.information import informs_rays
 from lidardesign.registry import plugin_guard
-from lidardesign.run.child import ChildError, ask
+from lidardesign.run.processes import ChildError, ask
 from lidardesign.space import DesignSpace
 from lidardesign.task import Split, scenes_of
 

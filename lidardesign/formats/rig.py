@@ -14,14 +14,13 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from shlex import quote
 from typing import Any
 
 import numpy as np
 
 from lidardesign.constraints.document import MOST_FITTED, Constraints, SensorConstraints
 from lidardesign.constraints.origins import axes_outside, place_text, snap_place_to_space
-from lidardesign.errors import ConfigError, DataError, InfeasibleError
+from lidardesign.errors import ConfigError, DataError, InfeasibleError, pasted
 from lidardesign.numerics import SLACK
 from lidardesign.run.validation import is_name
 from lidardesign.run.yaml import merged, plain_number
@@ -131,7 +130,7 @@ def rig_design(rig: Rig, path: Path, reach_m: float | None) -> DesignSpec:
         raise DataError(
             f"does not say how far {unknown} of its {total} rays reach",
             where=str(path),
-            hint=f"{rig.end_hint}; or name a run that does: lidardesign evaluate RUN {quote(path.name)}",
+            hint=f"{rig.end_hint}; or name a run that does: lidardesign evaluate RUN {pasted(path)}",
         )
     if unknown:
         notes.append(

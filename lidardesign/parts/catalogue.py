@@ -186,10 +186,10 @@ def _module(name: str) -> Part:
         ConfigError: A name that says no field of view or zones, or impossible ones.
     """
     found = MODULE.fullmatch(name)
-    if found is None:
+    if found is None or not all(map(float, found.groups())):
         raise ConfigError(
             f"{name!r} does not describe a module",
-            where="parts",
+            where="--fov and --zones",
             allowed="a field of view in degrees and a number of zones, each width x height: --fov 45x45 --zones 8x8",
         )
     across, up = (float(text) / 2 for text in found.groups()[:2])

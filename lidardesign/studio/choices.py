@@ -18,7 +18,7 @@ from lidardesign.api.design import Design
 from lidardesign.api.run import Run
 from lidardesign.constraints.document import Constraints, SensorConstraints
 from lidardesign.constraints.slack import room_of, split_name
-from lidardesign.errors import ConfigError
+from lidardesign.errors import ConfigError, pasted
 from lidardesign.run.validation import parse_override
 from lidardesign.run_folder import ignore
 from lidardesign.sensors.sensor import Sensor, boresight_frame
@@ -152,11 +152,12 @@ class Choices:
 
     def command(self, name: str) -> str:
         """The command line that fits the same design."""
-        words = ["lidardesign", "constrain", str(self.run.folder if self.base is None else self.base.path)]
+        words = []
         bounds = [f"{key}={_text(value)}" for key, value in _sections(self.constraints)]
         for setting in (*bounds, *self.settings):
             words += ["--set", setting]
-        return join([*words, *(() if self.detector == "ideal" else ("--detector", self.detector)), "--name", name])
+        words += [*(() if self.detector == "ideal" else ("--detector", self.detector)), "--name", name]
+        return f"lidardesign constrain {pasted(self.run.folder if self.base is None else self.base.path)} {join(words)}"
 
     def constrained(self, key: str, text: str, scope: str = EVERY) -> Choices:
         """The choices with another bound; without text there is none.

@@ -7,6 +7,7 @@ what comes from a page of another origin, or under another host's name, is refus
 from __future__ import annotations
 
 import http
+import logging
 import secrets
 import threading
 from collections.abc import Callable, Iterator
@@ -27,6 +28,8 @@ from lidardesign.errors import ConfigError
 HOST, HOSTS = "127.0.0.1", ("127.0.0.1", "localhost")
 OPTION = "--port"
 TOKEN_BYTES = 24
+# Strangers may send anything, and the user's terminal is no log of it.
+SILENT = logging.Logger("studio", logging.CRITICAL + 1)
 END_S = 1.0  # for which what is under way is waited for
 
 
@@ -65,7 +68,7 @@ class Guard:
             len(hosts) != 1
             or hosts[0] not in names
             or not {*origins} <= {f"http://{name}" for name in names}
-            or not secrets.compare_digest(token.encode(), self.token.encode())
+            or not secrets.compare_digest(token.encode(errors="surrogateescape"), self.token.encode())
         )
 
     def within(self, request: Request) -> Request:
@@ -119,7 +122,7 @@ def _checked_by(guard: Guard) -> Iterator[None]:
                 return Response(http.HTTPStatus.FORBIDDEN, "Forbidden", Headers({"Content-Length": "0"}))
             return process_request(connection, guard.within(request))
 
-        return serve(*arguments, process_request=check, **options)
+        return serve(*arguments, process_request=check, logger=SILENT, **options)
 
     websocket_server.serve = checked_serve
     try:

@@ -93,17 +93,13 @@ class Studio:
         for worker in (self._page, self._answers):
             worker.stop()
         stop_server(self._server)
-        self.end()
+        self._ended.put(None)
 
     def __enter__(self) -> Studio:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.stop()
-
-    def end(self) -> None:
-        """End `wait`; what handles a signal may call it."""
-        self._ended.put(None)
 
     def wait(self) -> None:
         """Wait until the page is stopped."""

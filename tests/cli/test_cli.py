@@ -19,10 +19,11 @@ from lidardesign.api.design import Design
 from lidardesign.cli.main import run as run_program
 from lidardesign.cli.terminal import output as console_module
 from lidardesign.cli.terminal.design_tables import show_fit
-from lidardesign.cli.terminal.output import TerminatedError, command, plain_json
+from lidardesign.cli.terminal.output import command, plain_json
 from lidardesign.errors import InfeasibleError
 from lidardesign.parts.catalogue import Pose, find_part, part_design
 from lidardesign.report.tables import sensors_table
+from lidardesign.run.processes import TerminatedError
 from lidardesign.run.yaml import load_yaml
 from lidardesign.sensors.compare import difference, paired_sensors
 from lidardesign.sensors.design_file import save_design

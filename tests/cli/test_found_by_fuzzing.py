@@ -11,7 +11,7 @@ import pytest
 from lidardesign_tasks.robot.arm_robot import load_robot
 from support.command_line import make_run
 
-from lidardesign.cli.terminal.output import EXIT_INTERRUPTED, Output, describe_error
+from lidardesign.cli.terminal.output import Output, describe_error
 from lidardesign.constraints.document import MOST_FITTED, Constraints
 from lidardesign.density.fields.grids import _digest, _load
 from lidardesign.density.training.learned import seconds_at
@@ -117,7 +117,7 @@ def test_an_interruption_inside_a_compiled_kernel_is_an_interruption():
         interrupted_kernel()
     for error in (raised.value, blamed.value):
         document, code, text = describe_error(error, Output())
-        assert (document["kind"], code, text) == ("interrupted", EXIT_INTERRUPTED, "interrupted")
+        assert (document["kind"], code, text) == ("interrupted", 130, "interrupted")
 
 
 def test_a_library_that_cannot_be_is_named_where_it_comes_from(monkeypatch, tmp_path):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shlex
+import subprocess
 from types import SimpleNamespace
 
 import pytest
@@ -10,7 +12,7 @@ import pytest
 from lidardesign.cli.terminal import grids as progress
 from lidardesign.cli.terminal.grids import ProgressDisplay
 from lidardesign.cli.terminal.output import Output
-from lidardesign.errors import BackgroundNote
+from lidardesign.errors import LONGEST_TEXT, BackgroundNote, DataError, pasted, text_of
 
 
 @pytest.fixture
@@ -84,3 +86,32 @@ def test_an_export_says_in_one_line_what_the_format_cannot_hold(lidardesign, fla
     assert short.out.startswith("wrote one.sdf (12 rays")
     assert lidardesign(f"{export} --quiet").out == "one.sdf\n"
     assert "sdf" in lidardesign("export --list").out
+
+
+HOSTILE = "\x1b[31mred\x1b]0;title\x07\r\u202e\x9b"
+
+
+def test_what_others_wrote_neither_moves_the_terminal_nor_fills_it(capsys):
+    output, shown = Output(), r"\x1b[31mred\x1b]0;title\x07\r\u202e\x9b"
+    output.note(f"{HOSTILE}\n{'x' * 10**6}")
+    output.rich().print(HOSTILE)
+    captured = capsys.readouterr()
+    assert captured.out == f"{shown}\n"
+    assert captured.err.startswith(f"{shown}\nxxx")
+    assert len(captured.err) < LONGEST_TEXT + 100
+    assert str(DataError(HOSTILE, where=f"{HOSTILE}\nb")) == rf"{shown}\nb: {shown}"
+    assert len(text_of(ValueError("x" * 10**7))) < 2000
+
+
+@pytest.mark.parametrize("name", ["-dash", "--help", "a b", "it's", "$HOME", "`id`", "two\nlines", "~", "ü*", "a;b"])
+def test_a_path_in_a_message_can_be_pasted(name):
+    echo = subprocess.run(f"printf %s {pasted(name)}", shell=True, capture_output=True, check=True, text=True).stdout
+    assert echo == (f"./{name}" if name.startswith("-") else name)
+    assert shlex.split(pasted(name)) == [echo]
+
+
+@pytest.mark.parametrize("text", ["0", "1", "-5", "x", "", "²", "9" * 5000, "1000000000"])
+def test_a_width_of_the_environment_that_is_none_is_unknown(lidardesign, monkeypatch, text):
+    for name in ("COLUMNS", "LINES", "NUMBA_NUM_THREADS"):
+        monkeypatch.setenv(name, text)
+    assert "2D scenes in a 3D design space" in lidardesign("tasks list").out

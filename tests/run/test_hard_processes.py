@@ -167,6 +167,32 @@ class TestKillsFullDisksAndTwoWriters:
 
 
 TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
+# What a library or a plugin makes of an interruption, in the middle of its work.
+SWALLOWED = {
+    "passes over it": "try: time.sleep(60)\n    except BaseException: pass",
+    "keeps it": "try: time.sleep(60)\n    except BaseException as error: kept.append(error)",
+    "raises another error": "try: time.sleep(60)\n    except BaseException: raise ValueError from None",
+    "is in a finalizer": "type('Odd', (), {'__del__': lambda self: time.sleep(60)})()",
+    "goes on for ever": "while True:\n        try: time.sleep(60)\n        except BaseException: pass",
+    "is taken down for ever": "try: time.sleep(60)\n    finally: time.sleep(60)",
+}
+HOSTILE = """
+import time
+from lidardesign_tasks.flatland import FlatlandTask
+kept, scenes = [], FlatlandTask.scenes
+def hostile(*given):
+    open("working", "w").close()
+    {}
+    return scenes(*given)
+FlatlandTask.scenes = hostile
+"""
+# What a plugin leaves running, which program is given, and its exit code; the last is an error of ours.
+LEFT = {
+    "a thread": ("import threading, time; threading.Thread(target=time.sleep, args=(60,)).start()", 0),
+    "work at the exit": ("import atexit, time; atexit.register(time.sleep, 60)", 0),
+    "a finalizer": ("import time; Odd = type('Odd', (), {'__del__': lambda self: time.sleep(60)}); odd = Odd()", 0),
+    "nothing": ("import lidardesign.cli.main as main; main._invoke = lambda *_: 1 / 0", 70),
+}
 LONG = ("learning.steps=100000", "learning.batch=64", "learning.checkpoint_seconds=0.01")
 CLOSED = "import os; os.close({}); os.close({}); "
 
@@ -267,3 +293,26 @@ class TestStreamsLocalesAndSignals:
         assert (tmp_path / "run" / "config.yaml").is_file()
         assert not (tmp_path / "run" / ".lock").exists()
         assert not list((tmp_path / "run").glob(".*.tmp"))
+
+    @pytest.mark.parametrize("case", SWALLOWED)
+    def test_a_signal_ends_the_program_whatever_a_plugin_makes_of_it(self, tmp_path, case):
+        number, code = ((signal.SIGINT, 130), (signal.SIGTERM, 143))[[*SWALLOWED].index(case) % 2]
+        learn = ("learn", "flatland", "--preset", "draft", "--out", "run", "--json")
+        process = program(*learn, cwd=tmp_path, before=HOSTILE.format(SWALLOWED[case]))
+        while not (tmp_path / "working").exists() and process.poll() is None:
+            time.sleep(0.05)
+        time.sleep(0.1)
+        sent = time.monotonic()
+        process.send_signal(number)
+        _, err = process.communicate()
+        assert process.returncode == code
+        assert time.monotonic() - sent < 5
+        assert (err.startswith(b"interrupted" if code == 130 else b"terminated"), b"Traceback" in err) == (True, False)
+
+    @pytest.mark.parametrize("case", LEFT)
+    def test_the_program_ends_when_all_is_written_whatever_is_left_running(self, tmp_path, case):
+        before, code = LEFT[case]
+        process = program("tasks", "list", "--json", cwd=tmp_path, before=before)
+        out, err = process.communicate(timeout=30)
+        assert process.returncode == code, err
+        assert code or json.loads(out)["tasks"]

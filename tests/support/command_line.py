@@ -77,5 +77,6 @@ LISTENING = "import signal; signal.signal(signal.SIGINT, signal.default_int_hand
 
 def program(*arguments, before="", **options) -> subprocess.Popen:
     """The program in a process of its own; `before` is Python that runs first."""
-    code = f"{LISTENING}\n{before}\nfrom lidardesign.cli.main import run\nrun({[str(a) for a in arguments]!r})"
-    return subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options)
+    code = f"{LISTENING}\n{before}\nfrom lidardesign.__main__ import run\nrun()"
+    words = [sys.executable, "-c", code, *map(str, arguments)]
+    return subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options)

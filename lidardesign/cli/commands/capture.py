@@ -107,9 +107,13 @@ def capture(
         with phase("capture"):
             captured = load_capture(file)
         within_rad = default_within_rad(captured) if within_deg is None else math.radians(within_deg)
-        estimation = Estimation(estimator, false_alarm)  # type: ignore[arg-type]
+        settings = CaptureSettings(
+            Estimation(estimator, false_alarm),  # type: ignore[arg-type]
+            within_rad,
+            outlier_mm / 1000.0,
+            reference,
+        )
         with phase("scoring"):
-            settings = CaptureSettings(estimation, within_rad, outlier_mm / 1000.0, reference)
             evaluation = evaluate_capture(captured, named, settings)
         for note in evaluation.notes:
             output.remark(note)

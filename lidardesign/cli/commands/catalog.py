@@ -86,8 +86,11 @@ def list_(
             with contextlib.suppress(ConfigError):  # no source states a range under such conditions
                 vouched.append(part.under(reflectance_percent=reflectance, illuminance_klux=klux))
         left_out = len(parts) - len(vouched)
-        entries = {"parts": [part_entry(part) for part in vouched], "left_out": left_out}
-        output.result(entries, lambda rich: show_parts(vouched, rich), show_costs=False)
+        output.result(
+            {"parts": [part_entry(part) for part in vouched], "left_out": left_out},
+            lambda rich: show_parts(vouched, rich),
+            show_costs=False,
+        )
         if left_out:
             output.note(f"note: {left_out} of {len(parts)} parts and modes have no range stated for such conditions")
 
@@ -289,11 +292,9 @@ def show_parts(parts: Sequence[Part], rich: RichConsole) -> None:
 
 def show_part(part: Part, document: dict[str, Any], rich: RichConsole) -> None:
     """Print every figure of a part with its conditions and source, and what follows from them."""
-    from rich.text import Text
-
     from lidardesign.parts.part import conditions_of
 
-    rich.print(Text.assemble((part.name, "bold"), f": {part.product}, {part.kind}"))
+    rich.print(f"{part.name}: {part.product}, {part.kind}")
     rich.print(part.summary)
     if part.modes:
         rich.print(f"mode {part.mode} of {', '.join(part.modes)}")

@@ -252,8 +252,7 @@ def search_display(request: ScoreRequest | SeedsRequest, progress: ProgressDispl
     """Shows the best score of each search, in a line of its own."""
 
     def show(label: str, share: float, best: float) -> None:
-        found = f"best {best:.4g} {request.run.metric.unit}"
-        left_s = (1 - share) * request.cma_seconds
+        found, left_s = f"best {best:.4g} {request.run.metric.unit}", (1 - share) * request.cma_seconds
         progress.show(share, 1.0, label=label, detail=found, left_s=left_s, line=label)
 
     return show

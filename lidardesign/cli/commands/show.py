@@ -73,8 +73,9 @@ def show(
             if specification.constraints:
                 output.remark(f"the design space is not checked: {error}")
         space = None if run is None else run.config.space
-        bounds = space if specification.constraints else None
-        checks = check_design(design_document(specification), specification.constraints, bounds)
+        checks = check_design(
+            design_document(specification), specification.constraints, space if specification.constraints else None
+        )
         outside = [] if space is None else outside_notes(specification, space)
         for line in (*outside, *broken_notes(specification.name, checks)):
             output.remark(line)
@@ -158,9 +159,8 @@ def _show_summary(document: dict[str, Any], rich: RichConsole) -> None:
     if quality is not None and not scored:
         rich.print("no scores yet" if fine else "no designs yet")
     if document["cache"]:
-        kept = "cached for later fits: {path}, {megabytes:.1f} MB"
-        megabytes = document["cache"]["bytes"] / 1e6
-        rich.print(kept.format(**document["cache"], megabytes=megabytes), soft_wrap=True)
+        path, megabytes = document["cache"]["path"], document["cache"]["bytes"] / 1e6
+        rich.print(f"cached for later fits: {path}, {megabytes:.1f} MB", soft_wrap=True)
     if document["next"]:
         rich.print("\n".join(["next:", *(f"  {line}" for line in document["next"])]), soft_wrap=True)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from pathlib import Path
 from typing import Annotated
 
@@ -45,8 +44,6 @@ def studio(
         with output.progress("opening"):
             page = opened.studio(chosen, port=port)
         with page:
-            # an exception in the wrong moment could be lost
-            signal.signal(signal.SIGINT, lambda *_: page.end())
             print(page.address, flush=True)
             if not no_browser:
                 import webbrowser

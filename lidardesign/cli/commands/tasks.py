@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from shlex import quote
 from typing import Annotated, Any
 
 import typer
@@ -12,6 +11,7 @@ import typer
 from lidardesign.cli.terminal import options
 from lidardesign.cli.terminal.grids import RichConsole, text_table
 from lidardesign.cli.terminal.output import command
+from lidardesign.errors import pasted
 from lidardesign.run.clock import phase
 
 OUTCOMES = {"pass": ("pass", "green"), "fail": ("FAIL", "bold red"), "skip": ("skip", "dim")}
@@ -46,10 +46,14 @@ def list_(
 def _show_list(entries: list[dict[str, Any]], rich: RichConsole) -> None:
     from rich.text import Text
 
-    rows = []
-    for item in entries:
-        text = Text.assemble(("broken:", "red"), f" {item['error']}") if item["error"] else item["summary"]
-        rows.append((item["name"], text, item["distribution"]))
+    rows = [
+        (
+            item["name"],
+            Text.assemble(("broken:", "red"), f" {item['error']}") if item["error"] else item["summary"],
+            item["distribution"],
+        )
+        for item in entries
+    ]
     rich.print(text_table(("task", "what it is", "from"), rows))
 
 
@@ -70,13 +74,10 @@ def show(
 
 
 def _show_task(document: Mapping[str, Any], rich: RichConsole) -> None:
-    from rich.text import Text
-
     metric, defaults, space = document["metric"], document["defaults"], document["space"]
-    rich.print(Text.assemble((document["name"], "bold"), f": {document['summary']}"))
+    rich.print(f"{document['name']}: {document['summary']}")
     rich.print(f"metric: {metric['name']} [{metric['unit']}], {metric['better']} is better")
-    budgets = ", ".join(map(str, defaults["rays"]))
-    rich.print(f"defaults: level {defaults['level']:g}, evaluated at {budgets} rays")
+    rich.print(f"defaults: level {defaults['level']:g}, evaluated at {', '.join(map(str, defaults['rays']))} rays")
     _show_keys(document["config"], "configuration (--set KEY=VALUE)", rich)
     if space:
         rich.print("design space (--set space.KEY=[LOW,HIGH])", style="italic")
@@ -133,10 +134,9 @@ def check(
             from lidardesign.contract.contract import LAWS, refuse_broken
             from lidardesign.contract.process import CheckRequest, check_in_process
 
-        request = CheckRequest(name, config, tuple(overrides or ()), seed, seconds)
         findings = []
         with output.progress("contract") as progress, phase("contract"):
-            for finding in check_in_process(request):
+            for finding in check_in_process(CheckRequest(name, config, tuple(overrides or ()), seed, seconds)):
                 findings.append(finding)
                 progress.show(len(findings), len(LAWS) + 1, detail=finding.law)
         counts = {outcome: sum(finding.outcome == outcome for finding in findings) for outcome in OUTCOMES}
@@ -188,7 +188,7 @@ def new(
         def show_files(rich: RichConsole) -> None:
             for path in written:
                 rich.print(f"  {path}")
-            advice = f"next: pip install --editable {quote(f'{folder}[test]')}, then lidardesign tasks check {name}"
+            advice = f"next: pip install --editable {pasted(f'{folder}[test]')}, then lidardesign tasks check {name}"
             rich.print(advice, soft_wrap=True)
 
         output.result({"task": name, "folder": folder, "files": written}, show_files, show_costs=False)

@@ -38,21 +38,21 @@ def show_design(design: DesignSpec, rich: RichConsole) -> None:
     """Print a design's sensors as a table, with angles in degrees; a place that all share stands above it."""
     if design.condition is not None:
         _show_along(design, rich)
-        _show_certificates(design, rich)
-        return
-    rays = f"{design.count} rays per frame" if design.count else "rays per frame left open"
-    sensors = "1 sensor" if len(design.sensors) == 1 else f"{len(design.sensors)} sensors"
-    title = f"{design.name}: {sensors}, layout {design.layout}, {rays}{_condition(design)}"
-    where, poses = _poses(design)
-    cells = [
-        {"sensor": pose["sensor"], "weight": f"{sensor.weight:.3f}", "rays": number(rays), **pose}
-        for sensor, rays, pose in list(zip(design.sensors, _rays_of(design), poses, strict=True))[:MOST_ROWS]
-    ]
-    headings = [name.replace(" [deg]", "\n[deg]") for name in cells[0]]
-    rows = [list(row.values()) for row in cells]
-    rich.print(text_table(headings, rows, f"{title}\n{where}", headings[1:], overflow="fold"))
-    if len(design.sensors) > MOST_ROWS:
-        rich.print(f"... and {len(design.sensors) - MOST_ROWS} more sensors; --json lists all")
+    else:
+        rays = f"{design.count} rays per frame" if design.count else "rays per frame left open"
+        sensors = "1 sensor" if len(design.sensors) == 1 else f"{len(design.sensors)} sensors"
+        title = f"{design.name}: {sensors}, layout {design.layout}, {rays}{_condition(design)}"
+        where, poses = _poses(design)
+        cells = [
+            {"sensor": pose["sensor"], "weight": f"{sensor.weight:.3f}", "rays": number(rays), **pose}
+            for sensor, rays, pose in list(zip(design.sensors, _rays_of(design), poses, strict=True))[:MOST_ROWS]
+        ]
+        headings = [name.replace(" [deg]", "\n[deg]") for name in cells[0]]
+        rich.print(
+            text_table(headings, (row.values() for row in cells), f"{title}\n{where}", headings[1:], overflow="fold")
+        )
+        if len(design.sensors) > MOST_ROWS:
+            rich.print(f"... and {len(design.sensors) - MOST_ROWS} more sensors; --json lists all")
     _show_certificates(design, rich)
 
 
@@ -89,8 +89,10 @@ def _show_along(design: DesignSpec, rich: RichConsole) -> None:
     pattern, name = design.patterns[-1], design.condition
     first, last = pattern.ends
     title = f"{design.name}: {len(pattern)} rays at every {name} from {first:g} to {last:g}"
-    title += f" (travel {last - first:g} m, {len(pattern.knots)} knots)\nsensors at"
-    title += f" {design.sensors[0].as_text()['origin [m]']} m in {design.frame}, carried along {name}"
+    title += (
+        f" (travel {last - first:g} m, {len(pattern.knots)} knots)\n"
+        f"sensors at {design.sensors[0].as_text()['origin [m]']} m in {design.frame}, carried along {name}"
+    )
     figures = ("azimuth\n[deg]", "elevation\n[deg]", "gate start\n[m]", "gate end\n[m]", "gate width\n[m]")
     rows = [
         (
@@ -136,15 +138,13 @@ def show_constraints(checks: Sequence[ConstraintCheck], rich: RichConsole) -> No
 
     The bounds of the design space hold for every sensor; they are shown where they are broken.
     """
-    from rich.text import Text
-
     from lidardesign.constraints.slack import room_of
 
     rows = []
     for check in checks:
         if SPACE_MARK not in check.name or not check.satisfied:
             left = room_of(check)
-            holds = ("yes, tight" if left.is_tight else "yes") if check.satisfied else Text("no", style="bold")
+            holds = ("yes, tight" if left.is_tight else "yes") if check.satisfied else "no"
             rows.append((check.name, number(check.bound, 6), number(check.value, 6), _left(*left), holds))
     if rows:
         table = text_table(("constraint", "bound", "value", "left", "holds"), rows, "\nconstraints")

@@ -169,7 +169,7 @@ Parts = Annotated[
 ]
 Modules = Annotated[
     int | None,
-    typer.Option("--modules", metavar="N", help="This many modules with --fov and --zones.", show_default=False),
+    typer.Option("--modules", metavar="N", min=1, help="This many modules with --fov and --zones.", show_default=False),
 ]
 ModuleField = Annotated[
     str | None,

@@ -10,38 +10,44 @@ import errno
 import json
 import math
 import os
-import signal
+import re
 import sys
 import tempfile
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from shlex import quote
 from typing import TYPE_CHECKING, Any, TextIO
 
 import typer
 
 from lidardesign.cli.terminal.grids import ProgressDisplay, duration
 from lidardesign.cli.terminal.score_tables import show_times
-from lidardesign.errors import BackgroundNote, ConfigError, DataError, LidardesignError, NumericalError, lacks_memory
+from lidardesign.errors import (
+    LONGEST_TEXT,
+    BackgroundNote,
+    ConfigError,
+    DataError,
+    LidardesignError,
+    NumericalError,
+    escaped,
+    lacks_memory,
+    pasted,
+    text_of,
+)
 from lidardesign.run.clock import Clock, peak_memory_bytes, running
 from lidardesign.run.files import write_atomic
 from lidardesign.run.manifest import keep_timings
 from lidardesign.run.outputs import check_outputs
+from lidardesign.run.processes import DEBUG, ENDING, EXIT_INTERNAL, EXIT_WORDS, code_of_interruption
 
 if TYPE_CHECKING:
     from rich.console import Console as RichConsole
 
 SCHEMA_VERSION = 1
 EXIT_SYSTEM = 3
-EXIT_INTERNAL = 70
-EXIT_INTERRUPTED = 130
 EXIT_BROKEN_PIPE = 141
-EXIT_TERMINATED = 143
 PLAIN_WIDTH = 120
-# Where this is set in the environment, errors show their tracebacks.
-DEBUG = "LIDARDESIGN_DEBUG"
 NUMBA_CACHE = "numba/core/caching.py"
 DISK_FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
 STDOUT, STDERR = 1, 2
@@ -54,6 +60,12 @@ THREAD_DEFAULTS = {
     "OPENBLAS_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
     "OMP_WAIT_POLICY": "PASSIVE",
+}
+# Numbers in the environment that libraries fail on if they are none, or too small for a table.
+NUMBERS = {
+    "COLUMNS": "[2-9][0-9]|[1-9][0-9]{2,3}",
+    "LINES": "[1-9][0-9]{0,3}",
+    "NUMBA_NUM_THREADS": "[1-9][0-9]{0,3}",
 }
 PAGE_SUFFIXES = (".html", ".htm")  # of reports
 
@@ -99,9 +111,13 @@ class Output:
         """A rich console; it honours NO_COLOR, prints plain text where there is no terminal, and text as it is."""
         from rich.console import Console as RichConsole
 
+        class Console(RichConsole):
+            def render_str(self, text: str, **options: Any) -> Any:
+                return super().render_str(escaped(text, LONGEST_TEXT), **options)
+
         file = sys.stderr if stderr else self.stream
         width = None if file.isatty() or "COLUMNS" in os.environ else PLAIN_WIDTH
-        return RichConsole(file=file, highlight=False, markup=False, width=width)
+        return Console(file=file, highlight=False, markup=False, width=width)
 
     def note(self, text: str) -> None:
         """Print a note on stderr, unless --quiet."""
@@ -195,7 +211,7 @@ class Output:
 def print_message(text: str) -> None:
     """Print on stderr; a closed stderr is replaced by the null device."""
     try:
-        print(text, file=sys.stderr, flush=True)
+        print(escaped(text, LONGEST_TEXT), file=sys.stderr, flush=True)
     except (OSError, ValueError):
         sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - lives as long as the process
 
@@ -226,7 +242,7 @@ def command(*, json: bool, quiet: bool, verbose: bool = False) -> Iterator[Outpu
     except BrokenPipeError:
         forget_stdout()
         raise typer.Exit(EXIT_BROKEN_PIPE) from None
-    except (Exception, KeyboardInterrupt) as error:
+    except BaseException as error:
         code = report_error(error, output)
         try:
             output.stream.flush()
@@ -276,6 +292,7 @@ def forget_stdout() -> None:
 
 def report_error(error: BaseException, output: Output) -> int:
     """Print what went wrong, once, and return the exit code."""
+    ENDING.arrived = True
     document, code, text = describe_error(error, output)
     if output.json and not output.answered:
         print_json({"error": document, "exit_code": code}, output.stream)
@@ -287,22 +304,19 @@ def report_error(error: BaseException, output: Output) -> int:
 
 def describe_error(error: BaseException, output: Output) -> tuple[dict[str, Any], int, str]:
     """The JSON form of an error, its exit code, and its text for people."""
-    cause: BaseException | None = error
-    while cause is not None:  # compiled kernels that return into an interruption make it a SystemError
-        if isinstance(cause, KeyboardInterrupt):
-            kind, code = "interrupted", EXIT_INTERRUPTED
-            if isinstance(cause, TerminatedError):
-                kind, code = "terminated", EXIT_TERMINATED
-            further = output.when_interrupted()
-            text = f"{kind}: {further}" if further else kind
-            return {"kind": kind, "message": text}, code, text
-        cause = cause.__cause__
+    # compiled kernels that return into an interruption make it a SystemError, and half of a module is an ImportError
+    code = ENDING.signalled or code_of_interruption(error)
+    # what could not be written while tidying up is lost, and must be told
+    if code and not isinstance(error, DataError):
+        kind, further = EXIT_WORDS[code], output.when_interrupted()
+        text = f"{kind}: {further}" if further else kind
+        return {"kind": kind, "message": text}, code, text
     try:
         os.getcwd()
     except OSError:  # whatever it was that failed there
         error = DataError("the working folder no longer exists", hint="change to a folder that does")
     if isinstance(error, LidardesignError):
-        return error.as_dict(), error.exit_code, f"{error.kind} error: {error}"
+        return error.as_dict(), code or error.exit_code, f"{error.kind} error: {error}"
     if lacks_memory(error):
         text = "the computer ran out of memory; a smaller batch, field_resolution or preset needs less"
         return {"kind": "memory", "message": text}, NumericalError.exit_code, f"memory error: {text}"
@@ -320,7 +334,7 @@ def describe_error(error: BaseException, output: Output) -> tuple[dict[str, Any]
             "hint": "remove its files *.nbi and *.nbc",
         }
     else:
-        text = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        text = f"{type(error).__name__}: {text_of(error)}"
         hint = "this is a bug in lidardesign: please report it; LIDARDESIGN_DEBUG=1 shows where"
         document = {"kind": "internal", "message": text, "hint": hint}
         return document, EXIT_INTERNAL, f"internal error: {text}\n  {hint}"
@@ -330,9 +344,7 @@ def describe_error(error: BaseException, output: Output) -> tuple[dict[str, Any]
 
 def _damaged_cache(error: BaseException) -> str | None:
     """The folder of numba's cache where an error came from reading a damaged file in it; else None."""
-    trace = error.__traceback__
-    while trace is not None:
-        frame, trace = trace.tb_frame, trace.tb_next
+    for frame, _ in traceback.walk_tb(error.__traceback__):
         if frame.f_code.co_filename.replace(os.sep, "/").endswith(NUMBA_CACHE):
             folder = getattr(frame.f_locals.get("self"), "_cache_path", None)
             if folder is not None:
@@ -354,14 +366,13 @@ def keep_times(run: Path, name: str, output: Output, *, wait_s: float = SHORT_WA
         output.note(f"note: the times of {name} are not kept in {run}: {message}")
 
 
-class TerminatedError(KeyboardInterrupt):
-    """SIGTERM, treated like an interruption where things are tidied up."""
-
-
-def set_thread_defaults() -> None:
-    """One thread per numerical library unless the user chose otherwise."""
+def set_defaults() -> None:
+    """One thread per numerical library unless the user chose otherwise; other numbers than these must be some."""
     for name, value in THREAD_DEFAULTS.items():
         os.environ.setdefault(name, value)
+    for name, allowed in NUMBERS.items():
+        if not re.fullmatch(allowed, os.environ.get(name, "")):
+            os.environ.pop(name, None)
 
 
 def make_streams_tolerant() -> None:
@@ -376,16 +387,6 @@ def make_streams_tolerant() -> None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 - lives as long as the process
         with contextlib.suppress(AttributeError, ValueError):
             getattr(sys, name).reconfigure(errors="backslashreplace")
-
-
-def terminate_cleanly() -> None:
-    """Let SIGTERM end the program as Ctrl-C does, so that checkpoints and locks are tidied up."""
-
-    def interrupt(*_: Any) -> None:
-        raise TerminatedError
-
-    with contextlib.suppress(ValueError):
-        signal.signal(signal.SIGTERM, interrupt)
 
 
 @contextlib.contextmanager
@@ -419,7 +420,7 @@ def claim_outputs(output: Output, *, csv: Path | None = None, report: Path | Non
             f"{report.name} is not the name of an HTML page",
             where="--report",
             allowed=", ".join(PAGE_SUFFIXES),
-            hint=f"--report {quote(str(report.with_suffix('.html')))}; a browser prints it as PDF",
+            hint=f"--report {pasted(report.with_suffix('.html'))}; a browser prints it as PDF",
         )
     announce([path for path in (csv, report) if path is not None], output)
 

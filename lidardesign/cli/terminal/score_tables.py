@@ -226,18 +226,16 @@ def show_times(timings: Mapping[str, float], memory_bytes: int | None, rich: Ric
         return
     shown = {key: seconds for key, seconds in timings.items() if key != OTHER and seconds >= LEAST_SHARE * total}
     shown[OTHER] = total - sum(seconds for key, seconds in shown.items() if INSIDE not in key)
-    lines = []
-    for key, seconds in shown.items():
-        *outside, name = key.split(INSIDE)
-        lines.append(("  " * len(outside) + name, f"{seconds:.2f}", f"{100 * seconds / total:.0f} %"))
+    lines = [
+        ("  " * key.count(INSIDE) + key.split(INSIDE)[-1], f"{seconds:.2f}", f"{100 * seconds / total:.0f} %")
+        for key, seconds in shown.items()
+    ]
     memory = "" if memory_bytes is None else f"; peak memory: {memory_bytes / MEBIBYTE:.0f} MiB"
     print_table(f"where the time went{memory}", ("phase", "seconds", "share"), lines, rich, text=("phase",))
 
 
 def show_accuracy(accuracy: Accuracy, rich: RichConsole, *, verbose: bool) -> None:
     """Print the verdicts that ask for another setting; or every sweep, the roughest measurement first."""
-    from rich.text import Text
-
     for sweep in accuracy.sweeps if verbose else ():
         unit = f" [{sweep.unit}]" if sweep.unit else ""
         title = f"{sweep.knob}: {sweep.error_of}{unit}, against {sweep.against}; seconds of {sweep.work}"
@@ -253,8 +251,8 @@ def show_accuracy(accuracy: Accuracy, rich: RichConsole, *, verbose: bool) -> No
         if sweep.note:
             rich.print(f"note: {sweep.note}")
         rich.print()
-    marks = ("; ", ("*", "bold"), " is what to choose, (run) what this run does") if verbose else ()
-    rich.print(Text.assemble(f"accuracy measured in {duration(sum(accuracy.seconds.values()))}", *marks))
+    marks = "; * is what to choose, (run) what this run does" if verbose else ""
+    rich.print(f"accuracy measured in {duration(sum(accuracy.seconds.values()))}{marks}")
     for sweep in accuracy.sweeps:
         if sweep.default is not None and sweep.chosen is not sweep.default:
             rich.print(f"note: {sweep.knob}: {sweep.verdict}")

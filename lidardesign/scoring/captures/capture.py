@@ -33,8 +33,8 @@ import numpy as np
 from lidardesign.errors import DataError
 from lidardesign.formats.galvo import SPEED_OF_LIGHT_M_PER_PS, degree_frame, scan_directions
 from lidardesign.run.arrays import check_kind, guarded, read_npz
-from lidardesign.run.child import ChildError, ask
 from lidardesign.run.inputs import CAPTURE, check_bytes, check_file
+from lidardesign.run.processes import ChildError, ask
 
 REQUIRED = ("counts", "bin_width_ps", "start_ps", "origin_m")
 BORESIGHT = ("boresight_azimuth_deg", "boresight_elevation_deg")

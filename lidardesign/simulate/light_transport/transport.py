@@ -36,7 +36,7 @@ from typing import Any
 import numpy as np
 
 from lidardesign.errors import ConfigError, NumericalError
-from lidardesign.run.child import Child, ChildError
+from lidardesign.run.processes import Child, ChildError
 from lidardesign.scenes.casting import shared_caster
 from lidardesign.scenes.rays import Hits, Rays, receiver_axes
 from lidardesign.scenes.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Plane, Receiver, Scene, Sphere

@@ -18,7 +18,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from lidardesign.run.child import write_line
+from lidardesign.run.processes import write_line
 
 RAY_COLUMNS = ("origin", "direction", "cone_cosine_m1", "baseline", "dark_place", "dark_radius")
 LIGHT_COLUMNS = (

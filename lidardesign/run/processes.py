@@ -1,11 +1,13 @@
-"""Work in a child process, which may crash, hang, print or close files.
+"""The end of this process, by signals too, and work in child processes, which may crash, hang, print or close files.
 
-The process calls a function, named as `module:function`, with a request and the stream of its answers; the function
+A child process calls a function, named as `module:function`, with a request and the stream of its answers; the function
 returns the last one. Requests and answers are lines of JSON. Prints are kept apart from answers.
 """
 
 from __future__ import annotations
 
+import _thread
+import atexit
 import contextlib
 import importlib
 import io
@@ -17,12 +19,24 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Mapping
-from typing import Any, BinaryIO, Literal
+import traceback
+from collections.abc import Callable, Mapping
+from typing import Any, BinaryIO, Literal, NoReturn
 
+from lidardesign.errors import text_of
+from lidardesign.run.files import write_atomic
+
+EXIT_WORDS = {130: "interrupted", 143: "terminated"}
+EXIT_CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}
+EXIT_INTERNAL = 70
+# Between a signal that was swallowed and its repetition; for tidying up after it, or for what a plugin left behind; and
+# for a file that is being written then [s].
+AGAIN_S, END_S, WRITING_S = 0.25, 3.0, 60.0
+# Where this is set in the environment, errors show their tracebacks.
+DEBUG = "LIDARDESIGN_DEBUG"
 PROGRAM = (
     "import json, sys; path, *work = json.loads(sys.stdin.readline()); sys.path[:] = path; "
-    "from lidardesign.run.child import serve; serve(*work)"
+    "from lidardesign.run.processes import serve; serve(*work)"
 )
 BEGUN = b"begun\n"
 # Python and this package are loaded within this time [s].
@@ -33,6 +47,92 @@ GRACE_SECONDS = 2.0
 UNANSWERED = 117
 # Of what the work printed last [bytes].
 MOST_PRINTED = 20_000
+
+
+class TerminatedError(KeyboardInterrupt):
+    """SIGTERM, treated like an interruption where things are tidied up."""
+
+
+class Ending:
+    """The end of the program: after a signal, whoever swallows its exception; after the work, whatever a plugin left.
+
+    The exception is raised again until it arrives where errors are reported. A process that goes on is ended.
+    """
+
+    def __init__(self) -> None:
+        self.code, self.signalled, self.arrived, self._listens = EXIT_INTERNAL, 0, False, False
+        self._exit, self._tell = os._exit, print
+
+    def begin(self, tell: Callable[[str], None]) -> None:
+        """Listen to SIGTERM, and to SIGINT if it is not ignored.
+
+        Arguments:
+            tell: Prints a message.
+        """
+        self._listens, self._tell = True, tell
+        for number in EXIT_CODES:
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                signal.signal(number, self._interrupt)
+        # last: what libraries take down then is the system's anyway
+        atexit.register(self._leave)
+        if not os.environ.get(DEBUG):
+            sys.unraisablehook = threading.excepthook = self._tell_ignored
+
+    def end(self, code: int) -> NoReturn:
+        """End the process, and what a plugin left running after a while."""
+        if self.signalled and not self.arrived:
+            self._tell(EXIT_WORDS[self.signalled])
+        self.code, self.arrived = code, True
+        if self._listens:
+            _thread.start_new_thread(self._leave, (END_S,))
+        sys.exit(self.signalled or code)
+
+    def _interrupt(self, number: int, _: object) -> None:
+        if not self.signalled:
+            self.signalled = EXIT_CODES[number]
+            # threading has locks, and the main thread may hold them
+            _thread.start_new_thread(self._insist, (number,))
+        if not self.arrived and not code_of_interruption(sys.exception()):
+            raise TerminatedError if number == signal.SIGTERM else KeyboardInterrupt
+
+    def _insist(self, number: int) -> None:
+        for _ in range(int(END_S / AGAIN_S)):
+            time.sleep(AGAIN_S)
+            signal.pthread_kill(threading.main_thread().ident, number)
+        if not self.arrived:  # in a thread, as the message may not be read
+            _thread.start_new_thread(self._tell, (EXIT_WORDS[self.signalled],))
+        self._leave(AGAIN_S)
+
+    def _leave(self, after_s: float = 0.0) -> None:
+        """End the process after a while, unless it has ended by then; a file is written to its end before."""
+        time.sleep(after_s)
+        last = time.monotonic() + WRITING_S
+        while time.monotonic() < last and any(
+            frame.f_code is write_atomic.__code__
+            for innermost in sys._current_frames().values()
+            for frame, _ in traceback.walk_stack(innermost)
+        ):
+            time.sleep(AGAIN_S)
+        self._exit(self.signalled or self.code)
+
+    def _tell_ignored(self, lost: Any) -> None:
+        """Tell in a line what threads and finalizers raise, where nothing can be done about it."""
+        if not issubclass(lost.exc_type, KeyboardInterrupt | SystemExit):
+            self._tell(f"note: ignored: {lost.exc_type.__name__}: {text_of(lost.exc_value)}")
+
+
+ENDING = Ending()
+
+
+def code_of_interruption(error: BaseException | None) -> int:
+    """The exit code of the interruption that an error is, comes from or was raised in; 0 without one."""
+    met: set[int] = set()
+    while error is not None and id(error) not in met:
+        if isinstance(error, KeyboardInterrupt):
+            return EXIT_CODES[signal.SIGTERM if isinstance(error, TerminatedError) else signal.SIGINT]
+        met.add(id(error))
+        error = error.__cause__ or error.__context__
+    return 0
 
 
 class ChildError(Exception):

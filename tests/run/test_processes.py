@@ -2,8 +2,8 @@
 
 import pytest
 
-from lidardesign.run import child
-from lidardesign.run.child import Child, ChildError, ask
+from lidardesign.run import processes
+from lidardesign.run.processes import Child, ChildError, ask
 
 
 def test_answers_come_back_apart_from_what_is_printed():
@@ -30,7 +30,7 @@ def test_answers_come_back_apart_from_what_is_printed():
     ],
 )
 def test_work_that_gives_no_answer_is_lost_with_the_reason(monkeypatch, work, reason, words):
-    monkeypatch.setattr(child, "GRACE_SECONDS", 0.1)
+    monkeypatch.setattr(processes, "GRACE_SECONDS", 0.1)
     with pytest.raises(ChildError) as lost:
         ask(f"support.work:{work}", None, 0.1 if work == "hangs" else 60, "while it works")
     assert (lost.value.reason, words in str(lost.value)) == (reason, True)
