@@ -142,18 +142,21 @@ class Lights:
     lead_m: np.ndarray
 
     @classmethod
-    def beams(cls, hits: Hits, rays: Rays, reflectance: np.ndarray, *, radius_m: np.ndarray | None = None) -> Lights:
+    def beams(
+        cls, hits: Hits, rays: Rays, reflectance: np.ndarray, *, watts: float = 1.0, radius_m: np.ndarray | None = None
+    ) -> Lights:
         """Patches lit by thin beams: matt points at first hits with the reflected power.
 
         Arguments:
             hits: First hits of the rays; all of them hit something.
             rays: The beams, M of them.
             reflectance: Reflectance at each hit, shape (M,).
+            watts: Power of each beam [W].
             radius_m: Radius of each patch [m], shape (M,).
         """
         return replace(
             cls.everywhere(rays.origin_m + hits.range_m[:, None] * rays.direction, hits.normal, 1.0),
-            intensity=reflectance / math.pi,
+            intensity=watts * reflectance / math.pi,
             least_cosine=np.zeros(len(rays)),
             lambertian=np.ones(len(rays), dtype=bool),
             radius_m=np.zeros(len(rays)) if radius_m is None else radius_m,
@@ -213,12 +216,14 @@ class Transients:
         bins: The bins of path length.
         ray, cell: Indices of rays and bins with light, each pair once, shape (K,).
         radiance: Radiance for lights in W/sr, shape (K,) [W / (m^2 sr)].
+        steady: Total radiance of each ray, also outside of the bins, shape (N,) [W / (m^2 sr)].
     """
 
     bins: PathBins
     ray: np.ndarray
     cell: np.ndarray
     radiance: np.ndarray
+    steady: np.ndarray
 
 
 def render_transient(
@@ -299,9 +304,11 @@ def render_transient(
         own_seed = int(np.random.SeedSequence([seed, number]).generate_state(1)[0])
         found = ask({**request, "seed": own_seed}, mine)
         parts.append({**found, "ray": found["ray"] + rows[0]})
-    ray, cell, radiance = (np.concatenate([part[name] for part in parts]) for name in ("ray", "cell", "radiance"))
+    ray, cell, radiance, steady = (
+        np.concatenate([part[name] for part in parts]) for name in ("ray", "cell", "radiance", "steady")
+    )
     real = ray < count
-    return Transients(bins, ray[real], cell[real], radiance[real].astype(float))
+    return Transients(bins, ray[real], cell[real], radiance[real].astype(float), steady[:count].astype(float))
 
 
 def _neighbourhood(first: Hits, rays: Rays, lights: Lights) -> tuple[np.ndarray, float]:

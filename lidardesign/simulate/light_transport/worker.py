@@ -217,10 +217,10 @@ def _render(mi: Any, dr: Any, request: dict[str, Any], arrays: dict[str, np.ndar
     depth = int(request["bounces"]) + 1
     integrator = mi.load_dict({"type": "transient_path", "max_depth": depth, "rr_depth": depth})
     current[:] = [Job(mi, dr, arrays, samples, bool(request["own"]))]
-    _, transient = integrator.render(scene, seed=int(request["seed"]), spp=samples)
+    steady, transient = integrator.render(scene, seed=int(request["seed"]), spp=samples)
     binned = np.asarray(transient)[0, :, :, 0]
     ray, cell = np.nonzero(binned)
-    return {"ray": ray, "cell": cell, "radiance": binned[ray, cell]}
+    return {"ray": ray, "cell": cell, "radiance": binned[ray, cell], "steady": np.asarray(steady)[0, :, 0]}
 
 
 def serve(_: object, answers: BinaryIO) -> dict[str, Any]:
