@@ -14,7 +14,7 @@ versions='import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14))'
 "$1" -m venv "$2" || exit 1
 "$2/bin/python" -m pip install --quiet --upgrade pip || exit 1
 # Linux alone has two kinds of wheels, one with the libraries of graphics cards
-torch=$("$2/bin/python" -m pip install --quiet --dry-run --no-deps --constraint constraints.txt --report - torch 2>/dev/null |
+torch=$("$2/bin/python" -m pip install --quiet --dry-run --ignore-installed --no-deps --constraint constraints.txt --report - torch 2>/dev/null |
     grep -o '"version": "[^"]*"' | tail -n 1)
 case "$(uname -s) $torch" in
 Linux*+cpu* | [!L]*) size="0.4 GB are downloaded, 1.7 GB installed (torch for the processor alone)" ;;
