@@ -440,8 +440,7 @@ def _admitted_part(name: str, named: Sequence[str]) -> Part | None:
         else:
             entries.append((None, *text.partition(":")[::2]))
     try:
-        library = load_library([path for path, _, _ in entries if path is not None])
-        part = library.part(name)
+        part = load_library([path for path, _, _ in entries if path is not None]).part(name)
     except ConfigError:
         return None
     stem = name.partition(":")[0]

@@ -302,8 +302,7 @@ def _enough_scenes(
     informed: list[InformedScene] = []
     while True:
         label = f"choosing among {len(bundle.placed)} poses of parts on {wanted} training scenes"
-        further = _timed(scenes, wanted - len(informed), label, progress)
-        informed += inform(further, first_scene=len(informed))
+        informed += inform(_timed(scenes, wanted - len(informed), label, progress), first_scene=len(informed))
         coverage = part_table(informed, len(bundle.placed))
         with phase("choice"):
             chosen = choose_set(coverage, limits)

@@ -245,8 +245,7 @@ def _searched(coverage: Coverage, limits: SetLimits, value: float) -> tuple[tupl
         if visits < 0:
             return best, False
         known = coverage.known(_gate(coverage, chosen))
-        may = limits.may_join(chosen, candidates)
-        gains = np.where(may, coverage.gains(known)[:, 0], 0.0)[order]
+        gains = np.where(limits.may_join(chosen, candidates), coverage.gains(known)[:, 0], 0.0)[order]
         gains[:first] = 0.0
         reached, left = float(coverage.weight @ coverage.counted(known)), limits.count - len(chosen)
         if reached > value * (1 + SLACK):

@@ -120,8 +120,7 @@ class HeldBackScenes:
                         decisions=tuple(replace(one, on=one.on and one.name != "multipath") for one in plan.decisions),
                     )
                 physics = self.planner.physics(self.plan, self.training.seed)
-            jobs = list(itertools.chain(*lists))
-            found = iter(score_lists(run.task, run.metric, scene, jobs, casters, physics))
+            found = iter(score_lists(run.task, run.metric, scene, list(itertools.chain(*lists)), casters, physics))
             for trial, own in zip(missing, lists, strict=True):
                 values = [next(found)[0].value for _ in own]
                 trial.scores = np.append(trial.scores, (values[0] + np.mean(values[1:] or values)) / 2)
@@ -346,8 +345,7 @@ class GoalSearch:
         if trial is None:
             return None
         same = next((one for one in self.tried if one.trial.fires_as(trial)), None)
-        costs = {"bandwidth": self._mbps(trial), "rays": len(trial.fired[0])}
-        cost = costs.get(request.least, trial.sensors)
+        cost = {"bandwidth": self._mbps(trial), "rays": len(trial.fired[0])}.get(request.least, trial.sensors)
         tried = replace(same, request=request) if same else GoalTrial(request, cost, trial, *self._judged(trial))
         self.tried.append(tried)
         return tried.cost if tried.keeps else None

@@ -71,13 +71,11 @@ class Proposals:
         inside = np.flatnonzero((owner >= 0) & (samples.weights > 0))
         # the same ray at another range is the same candidate
         _, first, same = np.unique(fired[inside, :RANGE], axis=0, return_index=True, return_inverse=True)
-        weights = np.bincount(same.reshape(-1), samples.weights[inside])
-        order = draw_order(weights, generator)
+        order = draw_order(np.bincount(same.reshape(-1), samples.weights[inside]), generator)
         order = order[first_candidates(owner[inside[first[order]]], count, least)]
         chosen = inside[first[np.sort(order)]]
         rays = rays_of_points(fired[chosen], owner[chosen], sensors)
-        lacking = max(count - len(chosen), 0)
-        even = split_budget(np.array([sensor.weight for sensor in sensors]), lacking)
+        even = split_budget(np.array([sensor.weight for sensor in sensors]), max(count - len(chosen), 0))
         even = np.maximum(even, least - np.bincount(owner[chosen], minlength=len(sensors))).astype(np.int64)
         if even.any():
             rays = Rays.joined([rays, even_rays(sensors, even)])
@@ -121,8 +119,7 @@ def first_candidates(owner: np.ndarray, count: int, least: np.ndarray) -> np.nda
     """
     taken = np.arange(len(owner)) < count
     for sensor in np.flatnonzero(np.bincount(owner[taken], minlength=len(least)) < least):
-        own = np.flatnonzero(owner == sensor)
-        taken[own[: int(least[sensor])]] = True
+        taken[np.flatnonzero(owner == sensor)[: int(least[sensor])]] = True
     return np.flatnonzero(taken)
 
 

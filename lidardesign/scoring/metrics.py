@@ -229,8 +229,7 @@ def _stereographic(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     length = np.linalg.norm(mean)
     opposite = SLACK  # directions this near (in 1 + cos) to the antipode have no finite coordinates
     mean = mean / length if length > opposite else np.array([0.0, 0.0, 1.0])
-    helper = np.eye(3)[np.argmin(np.abs(mean))]
-    right = np.cross(helper, mean)
+    right = np.cross(np.eye(3)[np.argmin(np.abs(mean))], mean)
     right /= np.linalg.norm(right)
     scale = 1 + directions @ mean
     seen = scale > opposite

@@ -351,8 +351,7 @@ def design_from_document(document: Any, where: str = "design", locate: Callable[
             hint="fit it again: lidardesign fit RUN" if older else "use that version",
         )
     # an optional key that is null counts as absent
-    given = {key: value for key, value in document.items() if value is not None}
-    file = check_model(DesignFile, given, locate)
+    file = check_model(DesignFile, {key: value for key, value in document.items() if value is not None}, locate)
     return DesignSpec(
         name=file.name or Path(where).stem,
         sensors=tuple(_sensors(file.sensors)),

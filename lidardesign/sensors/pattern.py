@@ -174,8 +174,7 @@ def even_rays(sensors: Sequence[Sensor], counts: Sequence[int]) -> Rays:
     ]
     origin_m = np.array([one.origin_m for one in sensors], dtype=np.float64)[sensor]
     gate_m = np.array([one.gate_m for one in sensors], dtype=np.float64)[sensor]
-    times = fire_times(len(sensor), DEFAULT_RATE_HZ)
-    return Rays(origin_m, np.concatenate(looking), gate_m, sensor, times)
+    return Rays(origin_m, np.concatenate(looking), gate_m, sensor, fire_times(len(sensor), DEFAULT_RATE_HZ))
 
 
 def field_on_sphere(sensor: Sensor) -> tuple[float, float]:

@@ -256,8 +256,7 @@ class Choices:
         paths = [name for name in names if re.search(PATH, str(name))]
         if paths:
             raise ConfigError(f"{paths[0]!r} is a path", where="parts.names", allowed="names of parts in the catalogue")
-        checked = Constraints.from_mapping(document).as_document()
-        return replace(self, constraints=checked, state="changed")
+        return replace(self, constraints=Constraints.from_mapping(document).as_document(), state="changed")
 
 
 def constraint_keys(model: type[BaseModel] = Constraints, prefix: str = "") -> Iterator[str]:

@@ -103,8 +103,7 @@ class Stage:
             self.api.add_label(
                 "/frame/name", f"x of {self._mount}", position=(length, 0, 0), font_screen_scale=LABEL_SCALE
             )
-            directions = np.concatenate([np.zeros((0, 3)), *(one.direction for one in rays)])
-            first = camera(directions)
+            first = camera(np.concatenate([np.zeros((0, 3)), *(one.direction for one in rays)]))
             # a robot that carries its sensors hides them from behind
             turn, share = (FROM_AHEAD_RAD, MOUNTED_AWAY) if self._is_mounted else (0.0, CAMERA_AWAY)
             away = share * self.extent_m * direction(first["turn"] - turn, first["height"])

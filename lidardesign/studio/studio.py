@@ -337,8 +337,7 @@ class Studio:
 
     def _find_blind(self, choices: Choices) -> None:
         if self._blind_is_shown:
-            surface = self._seen(choices.design, choices).unseen()
-            self._page.ask("blind", partial(self._stage.show_blind, *surface))
+            self._page.ask("blind", partial(self._stage.show_blind, *self._seen(choices.design, choices).unseen()))
 
     def _score(self, choices: Choices, beside: Design | None) -> None:
         key, metric = (choices.detector, choices.settings), self.run.metric
@@ -387,8 +386,7 @@ class Studio:
             f"{scores.evaluation.scenes} **held-out** scenes, which nothing was chosen on; {metric.better} is better."
         )
         heading = f"| | rays | Mbit/s | {metric.name} [{metric.unit}] |\n|---|---|---|---|"
-        figure = scores.figure("bandwidth")
-        self._panel.show_scores(f"{text}\n\n{heading}\n{rows}\n\n{ABOUT_BASELINES}", figure)
+        self._panel.show_scores(f"{text}\n\n{heading}\n{rows}\n\n{ABOUT_BASELINES}", scores.figure("bandwidth"))
         row = scores.rows[0]
         value = _figure(Interval(row.value, row.ci_low, row.ci_high), metric.unit)
         self._panel.say(f"{row.design}: {value} on held-out scenes; the tab Scores has the baselines")

@@ -70,8 +70,7 @@ def barycentric(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     normal = np.cross(b - a, c - a)
     crosses = [np.cross(p - points, q - points) for p, q in ((b, c), (c, a), (a, b))]
     areas = np.maximum(np.stack([np.einsum("nk,nk->n", cross, normal) for cross in crosses], axis=1), 0.0)
-    total = areas.sum(axis=1, keepdims=True)
-    return safe_divide(areas, total, otherwise=1 / 3)
+    return safe_divide(areas, areas.sum(axis=1, keepdims=True), otherwise=1 / 3)
 
 
 @dataclass(frozen=True, eq=False)

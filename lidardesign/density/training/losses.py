@@ -122,8 +122,7 @@ def balancing_loss(
     """A loss whose gradient balances mass by values of p*; also the reverse KL loss and the batch's ESS."""
     base, conditions = flow.draw(count, generator)
     learned, own = flow(base, conditions, held=True)
-    log_prob = own.detach()
-    log_weights = log_target_values(coordinates.join(learned, conditions), target, coordinates) - log_prob
+    log_weights = log_target_values(coordinates.join(learned, conditions), target, coordinates) - own.detach()
     log_z = logsumexp(log_weights) - np.log(count)
     centred = log_weights - log_z
     pull = centred.clamp(-LARGEST_PULL_NATS, LARGEST_PULL_NATS)

@@ -111,8 +111,7 @@ def coverage(
     log_mass = log_target - log_proposal
     mass = np.exp(log_mass - log_mass.max())
     covered = log_prob >= log_target - log_z + math.log(COVERED_RATIO)
-    error = weighted_mean_error(covered.astype(np.float64), mass)
-    return Estimate(float(mass[covered].sum() / mass.sum()), error)
+    return Estimate(float(mass[covered].sum() / mass.sum()), weighted_mean_error(covered.astype(np.float64), mass))
 
 
 # Tolerance of the root log Z, far below its statistical error.

@@ -152,11 +152,9 @@ def draw_samples(learned: LearnedFlow, count: int) -> Samples:
     points, log_prob, flow, coordinates = [], [], learned.flow, learned.coordinates
     with torch.no_grad():
         for start in range(0, count, POINTS_AT_ONCE):
-            size = min(POINTS_AT_ONCE, count - start)
-            base, conditions = flow.draw(size, learned.generator)
+            base, conditions = flow.draw(min(POINTS_AT_ONCE, count - start), learned.generator)
             values, log_density = flow(base, conditions)
-            unit = coordinates.join(values, conditions).cpu().double().numpy()
-            points.append(coordinates.space.from_unit(unit))
+            points.append(coordinates.space.from_unit(coordinates.join(values, conditions).cpu().double().numpy()))
             log_prob.append(log_density.cpu().double().numpy())
     points = np.concatenate(points)
     offset = coordinates.log_condition_density - coordinates.log_unit_volume

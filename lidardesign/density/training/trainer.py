@@ -337,8 +337,7 @@ class Trainer(LearnedFlow):
     @torch.no_grad()
     def _average(self) -> None:
         """Update the average: the flow itself until balancing begins, then a mean with polynomial weights."""
-        done = max(self.balanced_steps, 1)
-        share = (AVERAGING + 1) / (AVERAGING + done)
+        share = (AVERAGING + 1) / (AVERAGING + max(self.balanced_steps, 1))
         torch._foreach_lerp_(list(self.average.parameters()), list(self.flow.parameters()), share)
 
     def find_gradient(self) -> tuple[torch.Tensor, torch.Tensor, float, float]:

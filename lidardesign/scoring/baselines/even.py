@@ -359,8 +359,7 @@ def _parallel_crop(views: TrainingViews, space: DesignSpace, observed: np.ndarra
     """
     azimuth, elevation = parallel_angles(space, observed)
     looking = direction(azimuth, elevation)
-    hits_m = observed_point(observed)
-    low, high = (np.clip(end, space.low[:3], space.high[:3]) for end in central_interval(hits_m))
+    low, high = (np.clip(end, space.low[:3], space.high[:3]) for end in central_interval(observed_point(observed)))
     for axis in np.flatnonzero(np.abs(looking) > ALIGNED):
         low[axis] = high[axis] = space.low[axis] if looking[axis] > 0 else space.high[axis]
     low, high = np.append(low, [azimuth, elevation]), np.append(high, [azimuth, elevation])

@@ -144,8 +144,7 @@ def _even_rays(found: Survey, count: int) -> np.ndarray:
 
 def _lloyd_rays(found: Survey, count: int) -> np.ndarray:
     """Rays in the weighted middles of their cells, shape (count, 5)."""
-    many = max(FEWEST_POINTS, POINTS_PER_RAY * count)
-    points, chance = _fine_points(found, many)
+    points, chance = _fine_points(found, max(FEWEST_POINTS, POINTS_PER_RAY * count))
     nearest = found.table.nearest(points)
     density = found.table.share[nearest] ** PROBABILITY_POWER * found.table.area_m2_sr[nearest] ** AREA_POWER
     points, chance, density = points[density > 0], chance[density > 0], density[density > 0] / density.max()

@@ -68,8 +68,7 @@ class FirstHits:
     def of(cls, scene: Scene, frame: int, detector: Detector, lists: Sequence[Rays], caster: SceneCaster) -> FirstHits:
         """First hits of lists of rays in a frame."""
         rays = Rays.joined(lists)
-        sizes = np.array([len(one) for one in lists])
-        row = np.repeat(np.arange(len(lists)), sizes)
+        row = np.repeat(np.arange(len(lists)), [len(one) for one in lists])
         sharing = np.concatenate([detector.sharing(one) for one in lists])
         hits = caster.first_hit(rays.origin_m, rays.direction)
         return cls(scene, frame, detector, rays, row, sharing, hits, caster)

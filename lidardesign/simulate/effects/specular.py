@@ -57,8 +57,7 @@ class _Front:
     hits: Hits
 
     def subset(self, chosen: np.ndarray | slice) -> _Front:
-        hits = self.hits.subset(chosen)
-        return _Front(self.beams.subset(chosen), self.number[chosen], self.passed[chosen], hits)
+        return _Front(self.beams.subset(chosen), self.number[chosen], self.passed[chosen], self.hits.subset(chosen))
 
 
 def detours(scene: Scene, beams: Beams, hits: Hits, tracer: Tracer) -> Echoes:
