@@ -201,7 +201,8 @@ def _adaptive(
     patterns = []
     for number, gate in enumerate(found.gates):
         rows = found.rows(number, rays.sensor)
-        patterns.append(Pattern.of(replace(rays.subset(rows), gate_m=search.gate_m(gate)[rows]).as_angles()))
+        fired = replace(rays.subset(rows), gate_m=search.gate_m(gate)[rows])
+        patterns.append(Pattern.of(fired.as_angles()))
     return AdaptivePatterns(found.rule, tuple(patterns), found.shares)
 
 

@@ -120,7 +120,8 @@ class HeldBackScenes:
                         decisions=tuple(replace(one, on=one.on and one.name != "multipath") for one in plan.decisions),
                     )
                 physics = self.planner.physics(self.plan, self.training.seed)
-            found = iter(score_lists(run.task, run.metric, scene, list(itertools.chain(*lists)), casters, physics))
+            jobs = list(itertools.chain(*lists))
+            found = iter(score_lists(run.task, run.metric, scene, jobs, casters, physics))
             for trial, own in zip(missing, lists, strict=True):
                 values = [next(found)[0].value for _ in own]
                 trial.scores = np.append(trial.scores, (values[0] + np.mean(values[1:] or values)) / 2)

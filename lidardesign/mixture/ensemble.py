@@ -202,7 +202,8 @@ def _views(
     @cache
     def seen_by(entry: int, mount: Mount) -> np.ndarray:
         fixed = fix_origin(rules[entry], mount)
-        return reaim_samples(samples, drawn, (fixed,), Group(pins_of(fixed, samples.space), (0,)), retarget)[1]
+        group = Group(pins_of(fixed, samples.space), (0,))
+        return reaim_samples(samples, drawn, (fixed,), group, retarget)[1]
 
     # sensors beyond the entries of `each` are alike
     pairs = [(sensor, mount) for sensor, mounts in enumerate(options) for mount in mounts]

@@ -337,7 +337,8 @@ class Studio:
 
     def _find_blind(self, choices: Choices) -> None:
         if self._blind_is_shown:
-            self._page.ask("blind", partial(self._stage.show_blind, *self._seen(choices.design, choices).unseen()))
+            surface = self._seen(choices.design, choices).unseen()
+            self._page.ask("blind", partial(self._stage.show_blind, *surface))
 
     def _score(self, choices: Choices, beside: Design | None) -> None:
         key, metric = (choices.detector, choices.settings), self.run.metric

@@ -154,7 +154,8 @@ def draw_samples(learned: LearnedFlow, count: int) -> Samples:
         for start in range(0, count, POINTS_AT_ONCE):
             base, conditions = flow.draw(min(POINTS_AT_ONCE, count - start), learned.generator)
             values, log_density = flow(base, conditions)
-            points.append(coordinates.space.from_unit(coordinates.join(values, conditions).cpu().double().numpy()))
+            unit = coordinates.join(values, conditions).cpu().double().numpy()
+            points.append(coordinates.space.from_unit(unit))
             log_prob.append(log_density.cpu().double().numpy())
     points = np.concatenate(points)
     offset = coordinates.log_condition_density - coordinates.log_unit_volume
