@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support import references
 from support.flows import FLOWS, draw, flow_of
-from support.learning import SPACE, BallTask, Interrupter, a_trainer, config_of, learn, result_bytes
+from support.learning import SPACE, BallTask, Interrupter, a_trainer, begun, config_of, learn, result_bytes
 from support.spaces import log_volume
 
 from lidardesign.config import DensitySettings
@@ -235,7 +235,7 @@ class BallsTask(BallTask):
 def trainer_of(task, space, run, **settings):
     config = config_of(space, **settings)
     data = prepare_training_data(task, config)
-    return make_trainer(data, config, run, torch.device("cpu")), data, config
+    return make_trainer(data, config, begun(run), torch.device("cpu")), data, config
 
 
 @pytest.mark.hard_case(

@@ -50,11 +50,16 @@ def config_of(space=SPACE, seed=3, **settings):
     )  # fmt: skip
 
 
+def begun(run):
+    """A folder, made a run as by the command if it is none."""
+    if not (run / FILE_NAME).exists():
+        start_manifest(run, command=[], seed=0)
+    return run
+
+
 def learn(task, config, run, **options):
     """Learn in a folder, which is made a run as by the command."""
-    if not (run / FILE_NAME).exists():
-        start_manifest(run, command=[], seed=config.seed)
-    return density_learn.learn(task, config, run, **options)
+    return density_learn.learn(task, config, begun(run), **options)
 
 
 def result_bytes(run):
@@ -74,7 +79,7 @@ class Interrupter:
 
 def a_trainer(run):
     config = config_of()
-    return learning.make_trainer(prepare_training_data(BallTask(), config), config, run, torch.device("cpu"))
+    return learning.make_trainer(prepare_training_data(BallTask(), config), config, begun(run), torch.device("cpu"))
 
 
 def interrupt_after_a_checkpoint(monkeypatch, folder):
