@@ -43,7 +43,6 @@ SAME_HINT = "install the same versions of lidardesign and of the task for the sc
 AHEAD = 2
 _one_at_a_time = threading.Lock()
 Result = TypeVar("Result")
-Submit = Callable[..., Future[Any]]
 
 
 class Starmap(Protocol):
@@ -98,7 +97,7 @@ def opened_workers(workers: int | str, task: Task, scenes: int) -> Iterator[Star
 
 
 def _map_there(
-    submit: Submit,
+    submit: Callable[..., Future[Any]],
     threads: Callable[[], int],
     task: Task,
     function: Callable[..., Result],
@@ -135,7 +134,7 @@ def _check_versions(wanted: str, task: Task) -> None:
 
 
 @contextlib.contextmanager
-def _processes(count: int) -> Iterator[tuple[Submit, Callable[[], int]]]:
+def _processes(count: int) -> Iterator[tuple[Callable[..., Future[Any]], Callable[[], int]]]:
     """Worker processes of this machine, all started at once and killed at the end, even while busy.
 
     Each has a thread here and a pipe of its own, which ends when its process dies, also in the middle of a message.
@@ -143,18 +142,14 @@ def _processes(count: int) -> Iterator[tuple[Submit, Callable[[], int]]]:
     """
     context, processes, idle = multiprocessing.get_context("spawn"), [], SimpleQueue[Connection]()
 
-    def kill() -> None:
-        for process in processes:
-            process.kill()
-
     def ask(function: Callable[..., Result], *arguments: Any) -> Result:
         pipe = idle.get()
         try:
             pipe.send((function, arguments))
             result, error = pipe.recv()
         except (EOFError, OSError) as lost:
-            # calls before this one would be waited for
-            kill()
+            for process in processes:  # calls before this one would be waited for
+                process.kill()
             raise NumericalError(
                 "a worker process died",
                 where=OPTION,
@@ -180,7 +175,8 @@ def _processes(count: int) -> Iterator[tuple[Submit, Callable[[], int]]]:
     except BlockingIOError as error:
         raise ConfigError(f"{count} processes could not be started: {error.strerror}", where=OPTION) from error
     finally:
-        kill()
+        for process in processes:
+            process.kill()
         threads.shutdown(cancel_futures=True)
         for process in processes:
             process.join()
@@ -223,7 +219,7 @@ def _undisturbed() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _cluster(address: str, task: Task) -> Iterator[tuple[Submit, Callable[[], int]]]:
+def _cluster(address: str, task: Task) -> Iterator[tuple[Callable[..., Future[Any]], Callable[[], int]]]:
     """Workers of a running scheduler, which gives the scenes of lost workers to others.
 
     Logs of dask.distributed about lost connections are silenced in favour of the errors raised here.

@@ -160,8 +160,7 @@ class ExportRequest:
             notes: Called with every note.
         """
         file, exporter = self.target if file is None else file, self.exporter
-        count = 0 if exporter.name in WITHOUT_RAYS else self.rays
-        design, rays = self.source.at(count, self.at, notes)
+        design, rays = self.source.at(0 if exporter.name in WITHOUT_RAYS else self.rays, self.at, notes)
         with phase("writing"):
             lost = tuple(exporter.write(design, rays, file, self.rate_hz, self._robot()))
         for note in lost:

@@ -245,8 +245,7 @@ class LearnRequest:
             ConfigError, DataError: Unusable settings or scenes, or a folder that cannot be written.
             DivergenceError: Learning stayed non-finite; the last good checkpoint is kept.
         """
-        clock = outermost_clock() or Clock()
-        result = self._learned(clock, progress, remark)
+        result = self._learned(outermost_clock() or Clock(), progress, remark)
         if not self.replaces:
             return result
         note(self.place, learn={"run": str(self.folder)})

@@ -54,8 +54,7 @@ class TrainingScores:
         from lidardesign.rays.training_scenes import TrainingScenes
 
         run = self.run.with_settings(self.settings)
-        stream = TrainingScenes(run, run.config.seed).scenes(PURPOSE)
-        return list(itertools.islice(stream, self.count))
+        return list(itertools.islice(TrainingScenes(run, run.config.seed).scenes(PURPOSE), self.count))
 
     def _values(self, design: Design) -> np.ndarray:
         """The score in each scene."""

@@ -233,8 +233,7 @@ def label_statistics(mixture: Mixture, features: Features, labels: np.ndarray) -
     count = len(mixture)
     scattered = [np.bincount(labels, features.weights * row, minlength=count) for row in features.phi]
     local = np.einsum("nij,jn->in", mixture.frames[labels], features.directions)
-    ratio = angle_ratio(local[0], np.empty(len(labels)), np.empty(len(labels)))
-    u = local[1:] * ratio
+    u = local[1:] * angle_ratio(local[0], np.empty(len(labels)), np.empty(len(labels)))
     used = (features.axes.horizontal, features.axes.vertical)
     rows = [u[i] if used[i] else np.zeros(len(labels)) for i in range(2)]
     tangent = [

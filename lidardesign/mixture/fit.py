@@ -176,8 +176,7 @@ def _sensor_count(problem: FitProblem, budget: BandwidthBudget) -> int:
     mounted = most_mounted(constraints.rules)
     limits = (asked.max, mounted, budget.rays, most_rays(constraints))
     high = min((limit for limit in limits if limit is not None), default=math.inf)
-    usual = mounted or len(constraints.each) or DEFAULT_SENSORS
-    return int(min(max(usual, low), max(low, high)))
+    return int(min(max(mounted or len(constraints.each) or DEFAULT_SENSORS, low), max(low, high)))
 
 
 def _is_loose(rules: SensorRules, samples: Samples) -> bool:

@@ -71,8 +71,7 @@ class Proposals:
         inside = np.flatnonzero((owner >= 0) & (samples.weights > 0))
         # the same ray at another range is the same candidate
         _, first, same = np.unique(fired[inside, :RANGE], axis=0, return_index=True, return_inverse=True)
-        weights = np.bincount(same.reshape(-1), samples.weights[inside])
-        order = draw_order(weights, generator)
+        order = draw_order(np.bincount(same.reshape(-1), samples.weights[inside]), generator)
         order = order[first_candidates(owner[inside[first[order]]], count, least)]
         chosen = inside[first[np.sort(order)]]
         rays = rays_of_points(fired[chosen], owner[chosen], sensors)

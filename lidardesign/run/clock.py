@@ -99,9 +99,7 @@ def peak_memory_bytes() -> int | None:
     # on Linux getrusage includes the memory of the parent at the time of the fork
     with contextlib.suppress(OSError, ValueError, IndexError):
         return int(PROCESS_STATUS.read_text().split("VmHWM:")[1].split()[0]) * KIBIBYTE
-    try:
-        import resource
-    except ImportError:  # not on Windows
-        return None
+    import resource
+
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * KIBIBYTE

@@ -243,8 +243,7 @@ class _Builder:
         if len(self._stack) >= MAX_DEPTH:
             raise self._error(event, "nested too deeply", f"at most {MAX_DEPTH} levels")
         value: Any = {} if isinstance(event, yaml.MappingStartEvent) else []
-        path = self._put(value, event)
-        self._stack.append(_Frame(value, path))
+        self._stack.append(_Frame(value, self._put(value, event)))
 
     def _expects_key(self) -> bool:
         return bool(self._stack) and isinstance(self._stack[-1].value, dict) and self._stack[-1].key is None

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lidardesign.errors import BackgroundNote, ConfigError, DataError
+from lidardesign.errors import BackgroundNote, DataError
 from lidardesign.run.inputs import ROBOT_FILES, check_bytes, check_file, read_head
 from lidardesign.run.xml import read_xml
 from lidardesign.scenes.mesh_files import check_mesh
@@ -119,13 +119,8 @@ class ModelBody:
 
 
 def import_mujoco() -> Any:
-    """Import MuJoCo; raises ConfigError where it is missing."""
-    try:
-        return import_module("mujoco")
-    except ImportError as error:
-        raise ConfigError(
-            f"MuJoCo models need mujoco, which cannot be imported ({error})", hint="pip install mujoco"
-        ) from error
+    """Import MuJoCo, which takes a second, when it is used."""
+    return import_module("mujoco")
 
 
 @contextmanager
@@ -152,7 +147,6 @@ def load_model(
 
     Raises:
         DataError: A file is missing, unreadable, too large, outside the model's folder, or no model.
-        ConfigError: MuJoCo is not installed.
     """
     path = Path(path)
     root = _documents(path, folder)[1]

@@ -355,8 +355,7 @@ class StrictCommand(TyperCommand):
         Raises:
             ConfigError: At the option or argument.
         """
-        rest = list(args)
-        given = {} if ctx.resilient_parsing else self.make_parser(ctx).parse_args(args=rest)[0]
+        given = {} if ctx.resilient_parsing else self.make_parser(ctx).parse_args(args=list(args))[0]
         texts = [(parameter, text) for parameter in self.get_params(ctx) for text in _texts(given.get(parameter.name))]
         for parameter, text in texts:
             if not text.strip():

@@ -240,8 +240,7 @@ def _effect_measurements(bench: Bench, there: Sequence[str], *, marks: bool) -> 
     }
     if planned not in settings.values():
         settings[bench.planner.choice if isinstance(bench.planner.choice, str) else "those named"] = planned
-    alone = {f"{name} alone": [frozenset({name})] * count for name in there}
-    passes = _passes(bench, settings | alone)
+    passes = _passes(bench, settings | {f"{name} alone": [frozenset({name})] * count for name in there})
     full, none = passes["all"], passes["none"]
     changes = {
         f"without {name}": {

@@ -80,8 +80,7 @@ class Zone:
         ends = np.sin([self.low[1], self.high[1]])
         chosen = np.flatnonzero((sine >= ends[0]) & (sine <= ends[1]))
         azimuth = self.low[0] + np.mod(chosen * GOLDEN_TURN - self.low[0], FULL_TURN)
-        inside = azimuth <= self.high[0]
-        return np.column_stack([azimuth, np.arcsin(sine[chosen])])[inside]
+        return np.column_stack([azimuth, np.arcsin(sine[chosen])])[azimuth <= self.high[0]]
 
     def widened(self, share: float, space: DesignSpace) -> Zone:
         """The field widened by a share of its extents at every side, within the design space."""

@@ -71,8 +71,7 @@ def survey(views: TrainingViews, space: DesignSpace) -> Survey | None:
     low, high = crop.low, crop.high
     if directions is None:
         low[AZIMUTH:], high[AZIMUTH:] = widened_angles(low[AZIMUTH:], high[AZIMUTH:], WIDER, space)
-    count = 2 * dense_rays(int((high > low).sum()))
-    table = views.returns(even_placement(low, high, count, directions))
+    table = views.returns(even_placement(low, high, 2 * dense_rays(int((high > low).sum())), directions))
     return Survey(low, high, directions, table) if (table.share >= LEAST_SHARE).any() else None
 
 

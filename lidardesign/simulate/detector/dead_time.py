@@ -11,8 +11,6 @@ with h the photons that arrived in alive pulses, of which only one per pulse and
 The correction does not restore lost photons: a pulse in a bin with few alive pulses has few counts.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -15,8 +15,6 @@ It is reported if the photons within one full width at half maximum around it ar
 brings anywhere in the window with the allowed probability: bins * P(Poisson(b m) >= n) <= false_alarm, m bins wide.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
