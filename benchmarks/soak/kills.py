@@ -7,7 +7,8 @@ nobody disturbed, but for the seconds in them. A folder of several files must be
 unfinished, and be the new one once the command is given again. Of two commands at once in one folder one must work, and
 the other must work or be told why not.
 
-Any command, as a program of its own, ends with 130 or 143 within 5 s of a SIGINT or SIGTERM at any time.
+Any command, as a program of its own, ends with 130 or 143 within 5 s of a SIGINT or SIGTERM at any time, and with a
+message within 10 s of the death of one of its workers, unless it needs it no more.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 from trimesh.creation import box
 
@@ -45,6 +47,7 @@ from benchmarks.soak.disturbed import (
     unreadable,
 )
 from benchmarks.soak.long_runs import amount
+from lidardesign.errors import NumericalError
 from lidardesign.run.inputs import UNFINISHED, unfinished_names
 
 # Commands that are given at once, in a folder as it was before one of them.
@@ -69,12 +72,14 @@ SETS = {
 }
 PARTS = {"old": "vl53l8cx", "new": "tmf8828"}
 WORKERS = ["--workers", "2"]
+CONSTRAIN = ["constrain", "run", "--set", "gate.width_m.max=0.5"]
 # Programs that are sent signals: where a command of this name is given, and what is given.
 PROGRAMS = {
     "learn": ("learn", LEARN),
     "fit": ("fit", FIT),
     "fit --workers": ("fit", [*FIT, *WORKERS]),
-    "constrain": ("evaluate", ["constrain", "run", "--set", "gate.width_m.max=0.5"]),
+    "constrain": ("evaluate", CONSTRAIN),
+    "constrain --workers": ("evaluate", [*CONSTRAIN, *WORKERS]),
     "evaluate": ("evaluate", EVALUATE),
     "evaluate --workers": ("evaluate", [*EVALUATE, *WORKERS]),
     "export": ("evaluate", ["export", "run/designs/fit.yaml", "--format", "npz", "--out", "rays.npz"]),
@@ -84,9 +89,10 @@ PROGRAMS = {
     "catalog": ("learn", ["catalog", "list"]),
     "tasks": ("learn", ["tasks", "check", "flatland"]),
 }
-LONGEST_PROGRAM_S, LONGEST_END_S = 6.0, 5.0
+LONGEST_PROGRAM_S, LONGEST_END_S, LONGEST_LOSS_S = 6.0, 5.0, 10.0
 # Death by the signal itself, before the first line of the program, counts.
 ENDS = {"SIGINT": (130, -signal.SIGINT), "SIGTERM": (143, -signal.SIGTERM)}
+OF_A_WORKER = "SIGKILL of a worker"
 REFUSED = (2, 3)
 LONGEST_DELAY_S = 2.0
 TERMINATED = 143
@@ -98,6 +104,7 @@ ROUND = [
     *(("pair", "", name) for name in PAIRS),
     *(("set", "SIGKILL", name) for name in SETS),
     *(("program", sent, name) for name in PROGRAMS for sent in ENDS),
+    *(("program", OF_A_WORKER, name) for name, (_, given) in PROGRAMS.items() if WORKERS[0] in given),
 ]
 
 
@@ -124,6 +131,8 @@ def test_what_is_disturbed_recovers(tmp_path, piece, straight, where, sent, name
             met, told, faults = set_killed(name, number, tmp_path)
         elif where == "pair":
             met, told, faults = at_once(straight(), name, number, tmp_path / "both")
+        elif sent == OF_A_WORKER:
+            return worker_killed(straight(), name, number, tmp_path)
         elif where == "program":
             return signalled(straight(), sent, name, number, tmp_path)
         else:
@@ -285,4 +294,34 @@ def signalled(straight: Straight, sent: str, name: str, number: int, place: Path
     return {
         "case": f"{name}, {sent} to the program", "counts": {"met at work, or both worked": int(met)},
         "figures": {"seconds to the end": took_s} if met else {}, "faults": faults,
+    }  # fmt: skip
+
+
+def worker_killed(straight: Straight, name: str, number: int, place: Path) -> dict[str, object]:
+    """Kill one of a program's workers at a random time."""
+    seconds = seconds_of(straight, name, place / "before")
+    generator = np.random.default_rng([zlib.crc32(name.encode()), number])
+    after_s = generator.uniform(0, seconds)
+    straight.before(PROGRAMS[name][0], place / "killed")
+    with subprocess.Popen(
+        [sys.executable, "-m", "lidardesign", *PROGRAMS[name][1]], cwd=place / "killed", text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+    ) as process:  # fmt: skip
+        time.sleep(after_s)
+        # the first keeps account of what the others share
+        workers = psutil.Process(process.pid).children()[1:] if process.poll() is None else []
+        began = time.monotonic()
+        if workers:
+            generator.choice(np.array(workers, dtype=object)).kill()
+        said, _ = process.communicate()
+    took_s, code = time.monotonic() - began, process.returncode
+    told = code == NumericalError.exit_code and "a worker process died" in said
+    faults = []
+    if workers and (took_s > LONGEST_LOSS_S or not (told or code == 0)):
+        faults.append(
+            f"{name}, worker killed after {after_s:.3f} s: exit code {code} {took_s:.1f} s later: {said[-300:]}"
+        )
+    return {
+        "case": f"{name}, {OF_A_WORKER}", "counts": {"met at work, or both worked": int(told)},
+        "figures": {"seconds to the end": took_s} if workers else {}, "faults": faults,
     }  # fmt: skip

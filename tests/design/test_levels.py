@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -32,7 +33,7 @@ def test_fields_and_gates_hold_as_many_standard_deviations_as_the_level_says():
 
 
 def gates_in(path):
-    design = load_design(path)
+    design = load_design(Path(path))
     gates = [sensor.gate_m for sensor in design.sensors]
     return design.level, np.diff(np.asarray(gates), axis=1).mean()
 

@@ -7,14 +7,12 @@ import math
 import shlex
 import signal
 import socket
-import subprocess
-import sys
 import threading
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.command_line import files_under
+from support.command_line import files_under, program
 from support.studios import make_robot_run, wait_for
 
 pytest.importorskip("viser", reason="viser is not installed (extra: studio)")
@@ -317,8 +315,7 @@ def test_nothing_is_left_of_a_page_that_is_stopped(robot):
 
 
 def test_ctrl_c_ends_the_command(robot):
-    command = [sys.executable, "-m", "lidardesign", "studio", str(robot.folder), "--no-browser"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with program("studio", robot.folder, "--no-browser", text=True) as process:
         address = process.stdout.readline()
         assert address.startswith("http://127.0.0.1:")
         process.send_signal(signal.SIGINT)
