@@ -88,8 +88,7 @@ def short_tour(points: np.ndarray) -> np.ndarray:
     near = found[~own].reshape(len(points), -1)
     starts = [np.arange(count), *([_nearest(points)] if count <= MOST_NEAREST else [])]
     best = min((_improved(points, near, start) for start in starts), key=lambda tour: travel(points[tour]))
-    longest = int(_lengths(points[best], points[np.roll(best, -1)]).argmax())
-    return np.roll(best, -(longest + 1))
+    return np.roll(best, -1 - int(_lengths(points[best], points[np.roll(best, -1)]).argmax()))
 
 
 def travel(stops: np.ndarray) -> float:

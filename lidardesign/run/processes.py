@@ -73,8 +73,9 @@ class Ending:
         for number in EXIT_CODES:
             if signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, self._interrupt)
-        # last: what libraries take down then is the system's anyway
+        # last, after what is printed at the exit: what libraries take down then is the system's anyway
         atexit.register(self._leave)
+        atexit.register(print, end="", flush=True)
         if not os.environ.get(DEBUG):
             sys.unraisablehook = threading.excepthook = self._tell_ignored
 
