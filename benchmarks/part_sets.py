@@ -88,7 +88,6 @@ def compared(options: Any, klux: float) -> dict[str, Any]:
     """The choice against the best other set at an illuminance."""
     from lidardesign.api.run import open_run
     from lidardesign.config import with_task_settings
-    from lidardesign.fitting.options import FitOptions
     from lidardesign.fitting.request import FitRequest
     from lidardesign.rays.training_scenes import TrainingScenes
 
@@ -98,7 +97,7 @@ def compared(options: Any, klux: float) -> dict[str, Any]:
     said: list[str] = []
     chosen = run.fit(**asked, settings=settings, name="choice", notes=said.append).specification
     took, clock = seconds() - began, time.perf_counter() - clock
-    request = FitRequest.resolve(run, FitOptions(**asked, settings=settings))
+    request = FitRequest.resolve(run, {**asked, "settings": settings})
     seen = type(run)(run.folder, run.task, with_task_settings(run.task, run.config, settings))
     designs = {"choice": chosen, **designs_of(request, TrainingScenes(seen, 0), options.others)}
     values, effects = scored(seen, request.planner, designs, options.scenes)

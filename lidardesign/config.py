@@ -15,7 +15,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
-from lidardesign.errors import MAX_SEED, ConfigError
+from lidardesign.errors import ConfigError
+from lidardesign.limits import MAX_SEED
 from lidardesign.numerics import COARSE_SLACK
 from lidardesign.registry import UnknownTaskError, load_task, plugin_guard
 from lidardesign.run.clock import phase

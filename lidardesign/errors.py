@@ -32,8 +32,6 @@ ARGUMENTS = {
     "time-budget": "time_budget_s",
     "weight": "weights",
 }
-# The largest seed.
-MAX_SEED = 2**63 - 1
 # Words of libraries that have no memory left.
 NO_MEMORY = ("allocate memory", "failed to map segment", "bad_alloc")
 # Hint for an option or a key without a value.
@@ -83,7 +81,7 @@ class LidardesignError(Exception):
     def name_arguments(self) -> None:
         """Replace names of command options in the message by names of function arguments."""
         texts = (self.message, self.where, self.allowed, self.hint)
-        self.message, self.where, self.allowed, self.hint = map(_as_argument, texts)
+        self.message, self.where, self.allowed, self.hint = map(with_arguments, texts)
 
     def as_dict(self) -> dict[str, object]:
         """Content of the error for `--json`."""
@@ -100,7 +98,8 @@ def escaped(text: Text, longest: int = LONGEST_PART) -> Text:
     return OBEYED.sub(lambda found: ascii(found[0])[1:-1], text)
 
 
-def _as_argument(text: Text) -> Text:
+def with_arguments(text: Text) -> Text:
+    """A text with names of function arguments for those of command options."""
     if text is None or "lidardesign " in text:
         # command lines are left as they are
         return text
@@ -158,7 +157,7 @@ class InfeasibleError(LidardesignError):
 
     def name_arguments(self) -> None:
         """Replace names of command options by names of function arguments, in conflicts too."""
-        self.conflicts = tuple(map(_as_argument, self.conflicts))
+        self.conflicts = tuple(map(with_arguments, self.conflicts))
         super().name_arguments()
 
     def as_dict(self) -> dict[str, object]:

@@ -11,7 +11,7 @@ itself, the paper's chart.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -20,6 +20,7 @@ import numpy as np
 
 from lidardesign.errors import ConfigError
 from lidardesign.numerics import FULL_TURN, SLACK, wrap_turn
+from lidardesign.run.yaml import plain_number
 
 DIMENSIONS = ("x_m", "y_m", "z_m", "azimuth_rad", "elevation_rad", "range_m")
 X, Y, Z, AZIMUTH, ELEVATION, RANGE = range(6)
@@ -260,3 +261,26 @@ class DesignSpace:
             condition=tuple(values.get("condition", ())),
             measure=values.get("measure", "solid_angle"),
         )
+
+
+def condition_values(at: Mapping[str, float] | Sequence[str]) -> dict[str, float]:
+    """The values of conditions, as {"x_m": 0.37}, also from texts; the design space checks their names.
+
+    Raises:
+        ConfigError: A text is not NAME=VALUE with a finite number, or a name is given twice.
+    """
+    if isinstance(at, Mapping):
+        return dict(at)
+    values: dict[str, float] = {}
+    for text in at:
+        name, equals, value = (part.strip() for part in text.partition("="))
+        try:
+            number = plain_number(value)
+        except ValueError:
+            number = math.nan
+        if not (name and equals and math.isfinite(number)):
+            raise ConfigError(f"{text!r}", where="--at", allowed="NAME=VALUE with a finite number, such as x_m=0.37")
+        if name in values:
+            raise ConfigError(f"{name} is given twice: {values[name]:g} and {number:g}", where="--at")
+        values[name] = number
+    return values

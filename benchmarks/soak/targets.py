@@ -160,7 +160,7 @@ def unpack(content: bytes, run: Path) -> None:
 
 def open_run_folders(folder: Path) -> Read:
     """As `fit RUN`, `evaluate RUN` and `learn --resume` do, up to the scenes."""
-    from lidardesign.api.scores import ScoreOptions, ScoreRequest
+    from lidardesign.api.scores import ScoreRequest
     from lidardesign.density.training.checkpoint import load_arrays, stored_snapshots
     from lidardesign.density.training.learned import seconds_at
     from lidardesign.samples import load_samples
@@ -169,7 +169,7 @@ def open_run_folders(folder: Path) -> Read:
 
     def read(content: bytes) -> object:
         unpack(content, run)
-        request = ScoreRequest.resolve([run], ScoreOptions(rays=[9]))
+        request = ScoreRequest.resolve([run], {"rays": [9]})
         samples, arrays = load_samples(run), load_arrays(run, "checkpoint.safetensors")
         figures = (samples.points, samples.weights, samples.effective_sample_size)
         return request.rays, figures, request.run.command_times(), arrays, stored_snapshots(run), seconds_at(run)

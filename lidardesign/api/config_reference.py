@@ -22,7 +22,8 @@ from lidardesign.config import (
     resolve,
 )
 from lidardesign.constraints.document import Constraints
-from lidardesign.errors import MAX_SEED, ConfigError, check_choice
+from lidardesign.errors import ConfigError, check_choice
+from lidardesign.limits import MAX_SEED
 from lidardesign.registry import plugin_guard
 from lidardesign.run.validation import parse_override
 from lidardesign.run.yaml import dump_yaml

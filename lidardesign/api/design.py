@@ -1,7 +1,4 @@
-"""Designs as users hold them: a specification, the run and the file that it belongs to, and what its fit found.
-
-Also several designs beside each other: collected, named apart, and the run in whose scenes all of them are scored.
-"""
+"""Designs as users hold them: a specification, the run and the file that it belongs to, and what its fit found."""
 
 from __future__ import annotations
 
@@ -9,7 +6,7 @@ import html
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 
@@ -20,28 +17,26 @@ from lidardesign.api.export import (
     export_target,
     exporter_of,
 )
-from lidardesign.constraints.document import Constraints
-from lidardesign.errors import ConfigError, DataError, check_number, names_arguments, pasted
-from lidardesign.fitting.options import FitOptions
-from lidardesign.fitting.request import FitRequest, FitResult
-from lidardesign.formats.designs import need_run, reach_beside, read_design, relative_folder, run_of
+from lidardesign.choices.files import ExportChoices, SimulateChoices
+from lidardesign.choices.flag import complete, takes
+from lidardesign.errors import ConfigError, names_arguments
+from lidardesign.fitting.options import DesignChoices
+from lidardesign.fitting.request import FitRequest
+from lidardesign.fitting.result import FitResult
+from lidardesign.formats.designs import need_run, relative_folder
 from lidardesign.rays.information import FEW_SCENES
 from lidardesign.run.clock import WAIT_S, Progress, phase
 from lidardesign.run.manifest import locked_run, write_recorded
 from lidardesign.run_folder import Notes, RunFolder, ignore, log_note, settings_texts
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Scene
-from lidardesign.sensors.compare import outside_space
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import design_text, save_design
-from lidardesign.task import moved_files, scoring_settings
 from lidardesign.workers import check_workers, opened_workers
 
 if TYPE_CHECKING:
-    from lidardesign.clouds.seen import Measuring, SeenScene
+    from lidardesign.clouds.seen import SeenScene
     from lidardesign.report.figures import Figure
-
-MOST_SCENES = 10_000
 
 
 class Design(DesignSource):
@@ -100,58 +95,14 @@ class Design(DesignSource):
         """Its name: that of its file and of its rows."""
         return self.specification.name
 
-    @names_arguments
+    @takes(DesignChoices)
     def constrain(
-        self,
-        *,
-        sensors: int | str | None = None,
-        constraints: Constraints | Mapping[str, Any] | Path | str | None = None,
-        rays: int | None = None,
-        layout: str | None = None,
-        channels: int | None = None,
-        gates: str | None = None,
-        level: float | None = None,
-        at: Mapping[str, float] | None = None,
-        weights: Sequence[str] | Mapping[str, Any] = (),
-        parts: Sequence[str] | str | None = None,
-        like: Path | str | None = None,
-        name: str | None = None,
-        seed: int | None = None,
-        certify: bool = False,
-        detector: Path | str | None = None,
-        settings: Sequence[str] | Mapping[str, Any] = (),
-        survive: int | None = None,
-        goal: float | None = None,
-        least: str | None = None,
-        adaptive: int | None = None,
-        workers: int | str = 1,
-        notes: Notes = log_note,
-        progress: Progress | None = None,
+        self, *, notes: Notes = log_note, progress: Progress | None = None, **choices: Unpack[DesignChoices]
     ) -> Design:
         """Fit it again in its run; what is not given stays as it is.
 
         Arguments:
-            sensors: How many, or "best": as many as score best on training scenes.
-            constraints: Constraints, a mapping of them, or a YAML file of them.
-            rays: Rays per frame over all sensors.
-            layout: chosen, even or spinning.
-            channels: Rings of each sensor of the layout spinning.
-            gates: "sensor" or "ray": one gate per sensor, or one per ray.
-            level: The share of rays and returns that fields of view and gates contain.
-            at: Values of conditions that the design is for, such as {"x_m": 0.37}.
-            weights: Settings of the task towards which the learned density is weighted.
-            parts: Real parts that the design is made of: names, NAME:MODE, paths of part files, or "catalog".
-            like: The file of a rig to be like: as many sensors at its places, none wider, as many rays.
-            name: The design's name; "constrained" by default.
-            seed: Seed of all random numbers; the run's by default.
-            certify: Whether every number of rays gets a certificate, not the middle one alone.
-            detector: The detector that judges sets of parts and numbers of sensors: a name, or a YAML file.
-            settings: Settings of the task, to choose in scenes other than the learned ones.
-            survive: 1: rays are chosen for the loss of any one sensor, too; by default as constraints say.
-            goal: The score that it has to keep on training scenes that were held back, in the metric's unit.
-            least: What it then has the least of: bandwidth (the default), rays, sensors or parts.
-            adaptive: At most so many patterns follow what they see; 1 for none.
-            workers: Processes that look at training scenes, or the address of a dask scheduler, tcp://HOST:PORT.
+            choices: Those of `DesignChoices`.
             notes: Called with every note.
             progress: Called with every step, as "choosing 361 rays", and twice None.
 
@@ -160,30 +111,8 @@ class Design(DesignSource):
             InfeasibleError: Constraints that contradict each other, or hold too little of the density.
         """
         run = need_run(self.run, self.name if self.path is None else self.path)
-        options = FitOptions(
-            sensors=sensors,
-            constraints=constraints,
-            rays=rays,
-            layout=layout,
-            channels=channels,
-            gates=gates,
-            level=level,
-            at=at or {},
-            weights=weights,
-            parts=parts,
-            like=like,
-            name=name,
-            seed=seed,
-            certify=certify,
-            detector=detector,
-            settings=settings,
-            survive=survive,
-            goal=goal,
-            least=least,
-            adaptive=adaptive,
-        )
-        request = FitRequest.resolve(run, options, self.specification, notes=notes)
-        return Design.fitted(request, workers=workers, notes=notes, progress=progress)
+        request = FitRequest.resolve(run, choices, self.specification, notes=notes)
+        return Design.fitted(request, workers=choices.get("workers", 1), notes=notes, progress=progress)
 
     def remounted(self, sensor: int, origin_m: Sequence[float], frame: np.ndarray) -> Design:
         """The design with one sensor at another pose; its rays go with it, and nothing is chosen again.
@@ -230,95 +159,73 @@ class Design(DesignSource):
         self.path = path
         return path
 
-    @names_arguments
+    @takes(ExportChoices)
     def export(
         self,
         path: Path | str | None = None,
         format: str | None = None,
         *,
-        rays: int | None = None,
-        at: Mapping[str, float] | None = None,
-        rate_hz: float | None = None,
-        robot: Path | None = None,
         notes: Notes = log_note,
+        **choices: Unpack[ExportChoices],
     ) -> Exported:
         """Write it for another program.
 
         Arguments:
             path: The file or folder; beside its own file by default.
             format: As `lidardesign export --list` shows them; by default what the path's ending says.
-            rays: Rays per frame.
-            at: Values of conditions.
-            rate_hz: Frames per second, in formats that hold them [Hz].
-            robot: A robot's MuJoCo model that the sensors are put into (mjcf).
+            choices: Those of `ExportChoices`.
             notes: Called with every note.
         """
-        out = None if path is None else Path(path)
+        chosen, out = complete(ExportChoices, choices), None if path is None else Path(path)
         exporter = exporter_of(format, out)
         target = export_target(self.path, out, exporter)
-        return ExportRequest(self, exporter, target, rays, at or {}, rate_hz, robot).write(notes=notes)
+        request = ExportRequest(
+            self, exporter, target, chosen["rays"], chosen["at"], chosen["rate_hz"], chosen["robot"]
+        )
+        return request.write(notes=notes)
 
-    @names_arguments
+    @takes(SimulateChoices)
     def simulate(
         self,
         scene: Path | str | Sequence[Scene] | None = None,
         *,
-        scenes: int = 1,
-        rays: int | None = None,
-        detector: str = "ideal",
-        settings: Sequence[str] | Mapping[str, Any] = (),
-        seed: int | None = None,
-        scale: float = 1.0,
         notes: Notes = log_note,
+        **choices: Unpack[SimulateChoices],
     ) -> list[SeenScene]:
         """What it sees in held-out scenes, with the effects that they call for, or in a mesh or robot of your own.
 
         Arguments:
             scene: A mesh file, a MuJoCo model in its initial configuration, or scenes of its run, as `run.scenes` gives
                 them; None: held-out ones.
-            scenes: How many held-out scenes.
-            rays: Rays per frame; its own by default, or the largest number of its task.
-            detector: The name of a detector, or its file.
-            settings: Settings of the task, for scenes other than the learned ones.
-            seed: Seed of all random numbers; the run's by default.
-            scale: Factor from the unit of a mesh to metres (0.001 for mm).
+            choices: Those of `SimulateChoices`.
             notes: Called with every note.
 
         Raises:
             ConfigError: An unknown choice, or no run to take scenes from.
             DataError: The file of the scene cannot be read.
         """
-        from lidardesign.clouds.seen import Measuring
-
-        measuring = Measuring(detector, seed)
-        return self.seen(measuring, scene, scenes=scenes, rays=rays, settings=settings, scale=scale, notes=notes)
+        return self.seen(scene, choices, notes=notes)
 
     def seen(
-        self,
-        measuring: Measuring,
-        scene: Path | str | Sequence[Scene] | None,
-        *,
-        scenes: int,
-        rays: int | None,
-        settings: Sequence[str] | Mapping[str, Any],
-        scale: float,
-        notes: Notes,
+        self, scene: Path | str | Sequence[Scene] | None, given: SimulateChoices, *, notes: Notes
     ) -> list[SeenScene]:
         """As `simulate`, with errors in terms of command-line options."""
-        from lidardesign.clouds.seen import scene_of_file, seen_in_file, seen_scenes
+        from lidardesign.clouds.seen import Measuring, scene_of_file, seen_in_file, seen_scenes
 
-        check_number(scenes, "--scenes", 1, MOST_SCENES, whole=True)
+        choices = complete(SimulateChoices, given)
+        rays, scenes, settings = choices["rays"], choices["scenes"], settings_texts(choices["settings"])
+        measuring = Measuring(str(choices["detector"]), choices["seed"])
         count, spec = self.usual_count(notes) if rays is None else rays, self.specification
         if scene is None:
             run = need_run(self.run, self.name)
             for note in run.input_notes():
                 notes(note)
-            found = seen_scenes(run, spec, count, scenes, measuring, settings_texts(settings))
+            found = seen_scenes(run, spec, count, scenes, measuring, settings)
             if len(found) < scenes:
                 notes(f"there are {len(found)} held-out scenes; --set test=N makes more, where the task has that key")
             return found
         if not isinstance(scene, Path | str):
-            return seen_scenes(need_run(self.run, self.name), spec, count, scene, measuring, settings_texts(settings))
+            return seen_scenes(need_run(self.run, self.name), spec, count, scene, measuring, settings)
         if settings or scenes != 1 or spec.condition is not None:
             fault = "a design whose rays follow a condition" if spec.condition is not None else "--set or --scenes"
             raise ConfigError(f"{fault} together with a scene of your own", where="--scene", allowed="held-out scenes")
@@ -326,7 +233,7 @@ class Design(DesignSource):
             notes("in a scene of your own the best single pattern fires")
         if measuring.seed is None and self.run is not None:
             measuring = replace(measuring, seed=self.run.config.seed)
-        return [seen_in_file(scene_of_file(Path(scene), spec.mount, scale), spec, count, measuring)]
+        return [seen_in_file(scene_of_file(Path(scene), spec.mount, choices["scale"]), spec, count, measuring)]
 
     def figure(self, count: int | None = None) -> Figure:
         """Its sensors in space, with fields of view and gates, and its rays where their number is given (plotly)."""
@@ -356,135 +263,6 @@ class Design(DesignSource):
         spec = self.specification
         rows = [{**sensor.as_text(), "weight": f"{sensor.weight:.3f}"} for sensor in spec.sensors]
         return html_table(f"{repr(self)[1:-1]}, in {spec.frame}", list(rows[0]), [list(row.values()) for row in rows])
-
-
-@phase("designs")
-def collect_designs(
-    targets: Sequence[Design | Path], judge: RunFolder | None = None, notes: Notes = log_note, names: Sequence[str] = ()
-) -> list[Design]:
-    """The designs that were named: of run folders all designs, of files the file; each once.
-
-    Arguments:
-        targets: Designs, design files and run folders.
-        judge: The run in whose scenes they are scored, where one was named.
-        notes: Called with every note.
-        names: The designs that are wanted; where a run has all of them, its others are not read.
-
-    Raises:
-        DataError: One is not there, or there are none.
-    """
-    designs: list[Design] = []
-    paths = [target for target in targets if isinstance(target, Path)]
-    opened = {path: RunFolder.open(path) for path in paths if path.is_dir()}
-    runs = [judge] if judge else list(opened.values())
-    reach_m = reach_beside([path for path in paths if path.is_file()], runs)
-    for target in targets:
-        if isinstance(target, Design):
-            designs.append(target)
-        elif target in opened:
-            run = opened[target]
-            wanted = [path for path in run.design_paths() if path.stem in names]
-            found = wanted if wanted and len(wanted) == len(set(names)) else run.design_paths()
-            designs += [Design(read_design(path, notes), run, path) for path in found]
-        elif not target.exists():
-            raise DataError("no such run or design", where=str(target), hint="give run folders or design files")
-        else:
-            design = read_design(target, notes, reach_m)
-            designs.append(Design(design, run_of(design, target), target))
-    seen: dict[object, Design] = {}
-    for design in designs:
-        # they may be renamed: a user's own keep their names
-        copy = Design(design.specification, design.run, design.path)
-        seen.setdefault(id(design) if design.path is None else design.path.resolve(), copy)
-    if not seen:
-        where = str(runs[0].folder if judge else next(iter(opened)))
-        raise DataError("the run has no designs yet", where=where, hint=f"lidardesign fit {pasted(where)}")
-    return list(seen.values())
-
-
-def select_by_name(designs: list[Design], names: Sequence[str]) -> list[Design]:
-    """The designs of these names; all of them without names.
-
-    Raises:
-        ConfigError: There is no design of a name.
-    """
-    known = {design.name for design in designs}
-    for name in names:
-        if name not in known:
-            raise ConfigError(f"no design {name!r}", where="--designs", allowed=", ".join(sorted(known)) or "none")
-    return [design for design in designs if not names or design.name in names]
-
-
-def name_apart(designs: list[Design]) -> list[Design]:
-    """Make the names of designs distinct, by their run's folder in front or their file's suffix behind.
-
-    Raises:
-        ConfigError: Two names are still equal.
-    """
-    alike: dict[str, list[Design]] = {}
-    for design in designs:
-        alike.setdefault(design.name, []).append(design)
-    for name, group in alike.items():
-        # of their runs, or of their files
-        places = [each.run.folder if each.run else each.path.parent if each.path else Path() for each in group]
-        folders = [place.resolve().name for place in places]
-        for design, folder in zip(group, folders, strict=True):
-            # files of one folder, as rig.csv and rig.sdf, differ in their endings alone
-            ending = design.path.suffix if design.path is not None and folders.count(folder) > 1 else ""
-            front = f"{folder}/" if len(set(folders)) > 1 else ""
-            if len(group) > 1:
-                design.specification = replace(design.specification, name=f"{front}{name}{ending}")
-    names = [design.name for design in designs]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice:
-        raise ConfigError(f"two designs are called {twice!r}", hint="rename one of the files")
-    return designs
-
-
-def scoring_run(designs: Sequence[Design], judge: RunFolder | None, notes: Notes = log_note) -> RunFolder:
-    """The run in whose scenes designs are scored: the named one, else the one that they came from.
-
-    Arguments:
-        designs: The designs; of those from a run of other settings a note says whether they fit here.
-        judge: The run that was named.
-        notes: Called with every note.
-
-    Raises:
-        ConfigError: There is none, or runs differ and none was named.
-    """
-    candidates = [judge] if judge else [design.run for design in designs if design.run is not None]
-    if not candidates:
-        raise ConfigError(
-            "no design comes from a run that can be found, so the task is unknown",
-            hint="name the run whose scenes are used: --in RUN",
-        )
-    judge = candidates[0]
-    other = next((run for run in candidates if _settings(run) != _settings(judge)), None)
-    if other is not None:
-        raise ConfigError(
-            f"{judge.folder} and {other.folder} differ in task, configuration or design space",
-            hint="name the run whose scenes are used: --in RUN",
-        )
-    for design in designs:
-        condition = design.specification.condition
-        if condition is not None and condition not in judge.config.space.condition:
-            raise ConfigError(
-                f"its rays follow {condition}, which the task {judge.task.name} does not have as a condition",
-                where=f"design {design.name}",
-                hint="fit a design at one value: lidardesign fit RUN --at",
-            )
-        if design.run is not None and _settings(design.run) != _settings(judge):
-            outside = outside_space(design.specification, judge.config.space)
-            there = f"; {outside} its design space" if outside else ""
-            moved = ", ".join(moved_files(design.run.config.task, judge.config.task))
-            there += f"; held out in one of these runs and learned from in the other: {moved}" if moved else ""
-            notes(f"{design.name} of {design.run.folder} is scored in the scenes of {judge.folder}{there}")
-    return judge
-
-
-def _settings(run: RunFolder) -> tuple[Any, ...]:
-    """A key that is equal for runs whose designs can be scored in the same scenes."""
-    return run.config.task_name, scoring_settings(run.task, run.config.task), run.config.space
 
 
 def html_table(caption: str, headings: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

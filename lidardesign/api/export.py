@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from lidardesign.run_folder import Notes, RunFolder, log_note
 from lidardesign.scenes.mujoco_models import RobotFile
 from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.design import DesignSpec
+from lidardesign.space import condition_values
 
 # Formats that hold sensors only.
 WITHOUT_RAYS = ("sensors-csv", "stl", "mounts")
@@ -132,7 +133,7 @@ class ExportRequest:
     exporter: Exporter
     target: Path
     rays: int | None = None
-    at: Mapping[str, float] = field(default_factory=dict)
+    at: Mapping[str, float] | Sequence[str] = ()
     rate_hz: float | None = None
     robot: Path | None = None
 
@@ -160,7 +161,8 @@ class ExportRequest:
             notes: Called with every note.
         """
         file, exporter = self.target if file is None else file, self.exporter
-        design, rays = self.source.at(0 if exporter.name in WITHOUT_RAYS else self.rays, self.at, notes)
+        count = 0 if exporter.name in WITHOUT_RAYS else self.rays
+        design, rays = self.source.at(count, condition_values(self.at), notes)
         with phase("writing"):
             lost = tuple(exporter.write(design, rays, file, self.rate_hz, self._robot()))
         for note in lost:

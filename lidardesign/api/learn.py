@@ -11,14 +11,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lidardesign.choices.flag import complete
+from lidardesign.choices.learn import LearnChoices
 from lidardesign.config import RunConfig, load_run_config, resolve, save_run_config
 from lidardesign.errors import (
     BackgroundNote,
     ConfigError,
     DataError,
     ThresholdError,
-    check_choice,
-    check_number,
     pasted,
 )
 from lidardesign.registry import distribution_of, load_task, plugin_guard, task_names
@@ -54,7 +54,6 @@ LEARNED_FILES = (
     CONFIGURATION, MANIFEST, "progress.jsonl", "checkpoint.safetensors", "flow.safetensors", SAMPLES, "snapshots/",
 )  # fmt: skip
 # Tolerances of the misplaced share that can be measured; a longer time budget is a mistake in the unit.
-TOLERANCES, TIME_BUDGETS_S = (1e-4, 0.9999), (1.0, 366 * 24 * 3600.0)
 # A tolerance is met where the measured share is at most so many standard errors above it.
 STANDARD_ERRORS = 2.0
 # Of a run that ends by the clock; config.yaml has the steps that it took once it has ended.
@@ -62,57 +61,26 @@ MOST_STEPS = 100_000_000
 NO_RUN, NO_RUN_HINT = "there is no run to resume", "leave out --resume to start one"
 
 
-@dataclass(frozen=True, kw_only=True)
-class LearnOptions:
-    """A user's choices for learning.
-
-    Arguments:
-        out: The run folder to make; runs/TASK by default.
-        preset: draft, standard or fine.
-        settings: Settings by dotted keys, such as {"learning.steps": 60} or ["learning.steps=60"].
-        config: A YAML file of settings.
-        seed: Seed of all random numbers.
-        device: auto, cpu or cuda.
-        resume: Continue an interrupted run.
-        overwrite: Replace a run that is in the folder, once the new one is learned.
-        tolerance: The setting learning.misplaced, which has to be reached.
-        time_budget_s: Steps are taken until this time has passed, however many they are [s].
-        command: The command line for the manifest.
+def learn_choices(given: LearnChoices) -> LearnChoices:
+    """A user's choices for learning, complete.
 
     Raises:
-        ConfigError: An unknown device, or a tolerance or time out of range.
+        ConfigError: One is out of its limits, or the tolerance is given twice.
     """
+    choices = complete(LearnChoices, given)
+    if choices["tolerance"] is not None:
+        said = [text for text in settings_texts(choices["settings"]) if text.startswith("learning.misplaced=")]
+        if said:
+            raise ConfigError(f"is given beside --set {said[0]}", where="--tolerance", allowed="one of the two")
+    return choices
 
-    out: Path | str | None = None
-    preset: str | None = None
-    settings: Sequence[str] | Mapping[str, Any] = ()
-    config: Path | str | None = None
-    seed: int | None = None
-    device: str = "auto"
-    resume: bool = False
-    overwrite: bool = False
-    tolerance: float | None = None
-    time_budget_s: float | None = None
-    command: Sequence[str] = field(default_factory=lambda: tuple(sys.argv))
 
-    def __post_init__(self) -> None:
-        check_choice(self.device, "--device", ("auto", "cpu", "cuda"))
-        if self.tolerance is not None:
-            check_number(self.tolerance, "--tolerance", *TOLERANCES)
-            said = [text for text in settings_texts(self.settings) if text.startswith("learning.misplaced=")]
-            if said:
-                raise ConfigError(f"is given beside --set {said[0]}", where="--tolerance", allowed="one of the two")
-        if self.time_budget_s is not None:
-            check_number(self.time_budget_s, "--time-budget", *TIME_BUDGETS_S)
-
-    @property
-    def overrides(self) -> tuple[str, ...]:
-        """The settings, those that a tolerance stands for, and those of a time budget where none of them is set."""
-        endless = () if self.time_budget_s is None else (f"learning.steps={MOST_STEPS}", "learning.misplaced=0")
-        given = settings_texts(self.settings) + (
-            () if self.tolerance is None else (f"learning.misplaced={self.tolerance}",)
-        )
-        return *(text for text in endless if not any(one.startswith(text.split("=")[0]) for one in given)), *given
+def overrides_of(choices: LearnChoices) -> tuple[str, ...]:
+    """The settings, those that a tolerance stands for, and those of a time budget where none of them is set."""
+    endless = () if choices["time_budget_s"] is None else (f"learning.steps={MOST_STEPS}", "learning.misplaced=0")
+    tolerance = choices["tolerance"]
+    given = settings_texts(choices["settings"]) + (() if tolerance is None else (f"learning.misplaced={tolerance}",))
+    return *(text for text in endless if not any(one.startswith(text.split("=")[0]) for one in given)), *given
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,54 +91,58 @@ class LearnRequest:
         task: The task.
         folder: The run folder.
         settings: The whole configuration.
-        options: The user's choices.
+        choices: The user's choices.
         begun: Whether a started run is resumed.
         replaces: Whether a run is in the folder, to be replaced once the new one is learned.
+        command: The command line for the manifest.
     """
 
     task: Task
     folder: Path
     settings: RunConfig
-    options: LearnOptions
+    choices: LearnChoices
     begun: bool = False
     replaces: bool = False
+    command: Sequence[str] = field(default_factory=lambda: tuple(sys.argv))
 
     @classmethod
-    def resolve(cls, task: str | None, options: LearnOptions, notes: Notes = log_note) -> LearnRequest:
+    def resolve(cls, task: str | None, given: LearnChoices, notes: Notes = log_note) -> LearnRequest:
         """The request of a user's choices; without a task, the one that its files name.
 
         Raises:
             ConfigError: An unknown task, impossible settings, or a folder that is not empty.
             DataError: There is no run to resume.
         """
-        config_file = None if options.config is None else Path(options.config)
-        choices = {
-            "preset": options.preset,
+        choices = learn_choices(given)
+        out, resumes = choices["out"], choices["resume"]
+        config_file = None if choices["config"] is None else Path(choices["config"])
+        wanted = {
+            "preset": choices["preset"],
             "config_file": config_file,
-            "overrides": options.overrides,
-            "seed": options.seed,
+            "overrides": overrides_of(choices),
+            "seed": choices["seed"],
         }
-        task = task or _task_named(config_file, Path(options.out) if options.resume and options.out else None)
+        task = task or _task_named(config_file, Path(out) if resumes and out else None)
         plugin = load_task(task)
-        folder = Path("runs") / task if options.out is None else Path(options.out)
-        replaces = options.overwrite and _holds_run(folder)
+        folder = Path("runs") / task if out is None else Path(out)
+        replaces = choices["overwrite"] and _holds_run(folder)
         place = next_to(folder, NEW) if replaces else folder
-        if options.resume and not place.is_dir():
+        if resumes and not place.is_dir():
             raise DataError(NO_RUN, where=str(place), hint=NO_RUN_HINT)
-        begun = options.resume and not _was_killed_before_it_began(place)
+        begun = resumes and not _was_killed_before_it_began(place)
         if begun:
-            plugin, settings = _resumed_settings(plugin, place, choices)
-            if settings.learning.steps == MOST_STEPS and options.time_budget_s is None:
+            plugin, settings = _resumed_settings(plugin, place, wanted)
+            if settings.learning.steps == MOST_STEPS and choices["time_budget_s"] is None:
                 raise ConfigError("the run ends by the clock", where="--resume", hint="add --time-budget SECONDS")
         else:
-            if options.resume:
+            if resumes:
                 notes("the run has nothing to resume from yet; it starts from the beginning")
             check_can_start(place)
-            settings = resolve(plugin, **choices)
+            settings = resolve(plugin, **wanted)
             if isinstance(settings.task, FolderConfig):
                 inputs = {INPUTS: input_hashes(settings.task)}
                 settings = replace(settings, task=settings.task.model_copy(update=inputs))
-        request = cls(plugin, folder, settings, options, begun, replaces)
+        request = cls(plugin, folder, settings, choices, begun, replaces)
         if replaces:
             recorded, kept = map(Path, sorted(files_of_run(folder))), named(list(map(str, unrecorded_files(folder))))
             designs = ", ".join(path.stem for path in recorded if path.parent.name == DESIGN_FOLDER)
@@ -228,10 +200,10 @@ class LearnRequest:
         data = prepare_training_data(self.task, settings, remark)
         return {
             "dry_run": True,
-            "reads": [str(path) for path in (self.options.config, *input_paths(settings.task)) if path],
+            "reads": [str(path) for path in (self.choices["config"], *input_paths(settings.task)) if path],
             "writes": writes,
             "settings": settings.as_document(),
-            "forecast": forecast(data, settings, self.place, self.options.device, self.options.time_budget_s),
+            "forecast": forecast(data, settings, self.place, self.choices["device"], self.choices["time_budget_s"]),
         }
 
     def run(self, progress: Callable[[LearnProgress], None] | None = None, remark: Notes | None = None) -> LearnResult:
@@ -258,14 +230,14 @@ class LearnRequest:
         with phase("libraries"):
             from lidardesign.density.training.learn import learn
 
-        folder, settings, budget_s = self.place, self.settings, self.options.time_budget_s
+        folder, settings, budget_s = self.place, self.settings, self.choices["time_budget_s"]
         with _new_folder(folder), run_lock(folder):
             if not self.begun:
                 check_can_start(folder)  # another process may have been faster
             with self._undone_on_failure():
                 if not self.begun:
                     # Write what the run is before anything is learned; the configuration last
-                    start_manifest(folder, command=list(self.options.command), seed=settings.seed)
+                    start_manifest(folder, command=list(self.command), seed=settings.seed)
                     note(folder, plugin=distribution_of(self.task.name), **{INPUTS: input_hashes(settings.task)})
                     save_run_config(settings, folder)
                 try:
@@ -274,7 +246,7 @@ class LearnRequest:
                         settings,
                         folder,
                         resume=self.has_checkpoint,
-                        device=self.options.device,
+                        device=self.choices["device"],
                         progress=progress,
                         is_over=None if budget_s is None else lambda _: clock.seconds >= budget_s,
                         remark=remark,
@@ -297,7 +269,10 @@ class LearnRequest:
         if not checkpoints:
             return "before the first checkpoint; nothing was kept"
         again = f"--out {pasted(self.folder)} {'--overwrite ' if self.replaces else ''}--resume"
-        for option, value in (("--tolerance", self.options.tolerance), ("--time-budget", self.options.time_budget_s)):
+        for option, value in (
+            ("--tolerance", self.choices["tolerance"]),
+            ("--time-budget", self.choices["time_budget_s"]),
+        ):
             again += "" if value is None else f" {option} {value:g}"
         last = f"the last checkpoint is {self.place / checkpoints[-1]}"
         return f"{last}\n  continue with: lidardesign learn {self.task.name} {again}"

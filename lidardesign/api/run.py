@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 from lidardesign.api.design import Design, html_table
-from lidardesign.api.learn import LearnOptions, LearnRequest, check_tolerance
-from lidardesign.constraints.document import Constraints
-from lidardesign.errors import ConfigError, DataError, LidardesignError, check_number, names_arguments, pasted
-from lidardesign.fitting.options import FitOptions
+from lidardesign.api.learn import LearnRequest, check_tolerance
+from lidardesign.choices.evaluate import EvaluateChoices
+from lidardesign.choices.flag import takes
+from lidardesign.choices.learn import LearnChoices
+from lidardesign.errors import ConfigError, DataError, LidardesignError, names_arguments, pasted
+from lidardesign.fitting.options import DesignChoices, fit_choices
 from lidardesign.fitting.request import FitRequest
 from lidardesign.formats.designs import folder_of, reach_of, read_design, relative_folder
 from lidardesign.run.clock import Progress
@@ -20,7 +21,6 @@ from lidardesign.run.files import writer
 from lidardesign.run.manifest import DAMAGED_HINT, read_manifest
 from lidardesign.run.outputs import CACHE
 from lidardesign.run_folder import MANIFEST, Notes, RunFolder, log_note
-from lidardesign.sensors.sensor import MOST_RAYS
 from lidardesign.task import Metric, mount_of
 
 if TYPE_CHECKING:
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from lidardesign.density.training.learned import LearnedDensity
     from lidardesign.samples import Verdict
 
-MOST_PORT = 65_535
 FIXED_BASELINES = ("uniform", "bounding", "silhouette", "lloyd", "greedy")  # with the same rays in every scene
 FIGURES = ("ess", "kl_nats", "log_z", "coverage", "misplaced")
 
@@ -118,58 +117,14 @@ class Run(RunFolder):
 
         return LearnedDensity(self.folder, self.task, self.config)
 
-    @names_arguments
+    @takes(DesignChoices)
     def fit(
-        self,
-        *,
-        sensors: int | str | None = None,
-        constraints: Constraints | Mapping[str, Any] | Path | str | None = None,
-        rays: int | None = None,
-        layout: str | None = None,
-        channels: int | None = None,
-        gates: str | None = None,
-        level: float | None = None,
-        at: Mapping[str, float] | None = None,
-        weights: Sequence[str] | Mapping[str, Any] = (),
-        parts: Sequence[str] | str | None = None,
-        like: Path | str | None = None,
-        name: str | None = None,
-        seed: int | None = None,
-        certify: bool = False,
-        detector: Path | str | None = None,
-        settings: Sequence[str] | Mapping[str, Any] = (),
-        survive: int | None = None,
-        goal: float | None = None,
-        least: str | None = None,
-        adaptive: int | None = None,
-        workers: int | str = 1,
-        notes: Notes = log_note,
-        progress: Progress | None = None,
+        self, *, notes: Notes = log_note, progress: Progress | None = None, **choices: Unpack[DesignChoices]
     ) -> Design:
         """Fit a design to the learned density; nothing is learned again, and nothing is saved yet.
 
         Arguments:
-            sensors: How many, or "best" (the default): as many as score best on training scenes; of parts also "1-4".
-            constraints: Constraints, a mapping of them, or a YAML file of them.
-            rays: Rays per frame over all sensors.
-            layout: chosen, even or spinning; by default chosen, where the task has a method `informs`.
-            channels: Rings of each sensor of the layout spinning.
-            gates: "sensor" or "ray": one gate per sensor, or one per ray.
-            level: The share of rays and returns that fields of view and gates contain.
-            at: Values of conditions that the design is for, such as {"x_m": 0.37}.
-            weights: Settings of the task towards which the learned density is weighted.
-            parts: Real parts that the design is made of: names, NAME:MODE, paths of part files, or "catalog".
-            like: The file of a rig to be like: as many sensors at its places, none wider, as many rays.
-            name: The design's name.
-            seed: Seed of all random numbers; the run's by default.
-            certify: Whether every number of rays gets a certificate, not the middle one alone.
-            detector: The detector that judges sets of parts and numbers of sensors: a name, or a YAML file.
-            settings: Settings of the task, to choose in scenes other than the learned ones.
-            survive: 1: rays are chosen for the loss of any one sensor, too; by default as constraints say.
-            goal: The score that it has to keep on training scenes that were held back, in the metric's unit.
-            least: What it then has the least of: bandwidth (the default), rays, sensors or parts.
-            adaptive: At most so many patterns follow what they see; 1 for none.
-            workers: Processes that look at training scenes, or the address of a dask scheduler, tcp://HOST:PORT.
+            choices: Those of `DesignChoices`.
             notes: Called with every note; they are logged by default.
             progress: Called with every step, as "choosing 361 rays", and twice None.
 
@@ -178,30 +133,8 @@ class Run(RunFolder):
             DataError: The density is too rough to fit to.
             InfeasibleError: Constraints that contradict each other, or hold too little of the density.
         """
-        options = FitOptions(
-            sensors=sensors,
-            constraints=constraints,
-            rays=rays,
-            layout=layout,
-            channels=channels,
-            gates=gates,
-            level=level,
-            at=at or {},
-            weights=weights,
-            parts=parts,
-            like=like,
-            name=name,
-            seed=seed,
-            certify=certify,
-            detector=detector,
-            settings=settings,
-            survive=survive,
-            goal=goal,
-            least=least,
-            adaptive=adaptive,
-        )
-        request = FitRequest.resolve(self, options, notes=notes)
-        return Design.fitted(request, workers=workers, notes=notes, progress=progress)
+        request = FitRequest.resolve(self, choices, notes=notes)
+        return Design.fitted(request, workers=choices.get("workers", 1), notes=notes, progress=progress)
 
     def designs(self) -> list[Design]:
         """The designs that are saved in the run, by name."""
@@ -262,10 +195,9 @@ class Run(RunFolder):
 
         check_baseline(baseline)
         name = name or f"{baseline}-rays"
-        FitOptions(name=name)  # refuses what no design may be called
         numbers = sorted(self.task.defaults.rays)
         count = numbers[len(numbers) // 2] if rays is None else rays
-        check_number(count, "--rays", 1, MOST_RAYS, whole=True)
+        fit_choices({"rays": count, "name": name})  # refuses what no design can have
         found = []
         if baseline in FIXED_BASELINES:
             request = evaluation_request(self, [], [count], [baseline], seed)
@@ -301,50 +233,20 @@ class Run(RunFolder):
             f"lidardesign export {pasted(best['path'])} --format csv --rays {rays} --out rays.csv",
         ]
 
-    @names_arguments
+    @takes(EvaluateChoices)
     def evaluate(
         self,
         designs: Sequence[Design | Path | str] | None = None,
         *,
-        rays: Sequence[int] | None = None,
-        baselines: Sequence[str] = (),
-        seed: int | None = None,
-        scenes_seed: int | None = None,
-        effects: str = "auto",
-        detector: str = "ideal",
-        range_tolerance_mm: float | None = None,
-        return_tolerance: float | None = None,
-        settings: Sequence[str] | Mapping[str, Any] = (),
-        mount_error: str | None = None,
-        losses: bool = False,
-        workers: int | str = 1,
-        cma_seconds: float | None = None,
-        accuracy: bool = False,
-        fail_above: float | None = None,
-        fail_unless_better: str | None = None,
         progress: Progress | None = None,
         notes: Notes = log_note,
+        **choices: Unpack[EvaluateChoices],
     ) -> Scores:
         """Score designs on held-out scenes against uniform, random, bounding, silhouette and greedy.
 
         Arguments:
             designs: Designs and design files, of other runs too; all that are saved in the run by default.
-            rays: Numbers of rays per frame; the task's by default.
-            baselines: Further baselines: "lloyd", "occupancy", "no-visibility" or "cma"; ["none"] leaves out all.
-            seed: Seed of all random numbers; the run's by default.
-            scenes_seed: Seed of the held-out scenes; `seed` by default.
-            effects: Physical effects: "auto", "all", "none", "audit" or names separated by commas.
-            detector: The name of a detector, or a YAML file.
-            range_tolerance_mm: Largest change of ranges by all skipped effects together [mm].
-            return_tolerance: Largest share of returns changed by all skipped effects together.
-            settings: Settings of the task, to score in scenes other than the learned ones.
-            mount_error: Standard deviations of mounting errors of sensors in further rows, as "5mm,0.5deg".
-            losses: Whether designs are scored with each of their sensors lost, too; those made for it always are.
-            workers: Processes that score scenes, or the address of a dask scheduler, tcp://HOST:PORT.
-            cma_seconds: Wall time of each search of the baseline cma [s].
-            accuracy: Whether the sweeps of accuracy are measured, too; takes minutes.
-            fail_above: Limit of the designs' values, in the metric's unit, for `Scores.check()`.
-            fail_unless_better: Baseline or design that every other design must be better than, likewise.
+            choices: Those of `EvaluateChoices`.
             progress: Called with the name of the scene, the scenes done, and all scenes.
             notes: Called with every note.
 
@@ -352,54 +254,12 @@ class Run(RunFolder):
             ConfigError: Invalid choices.
             DataError: There are no designs, or one is not there.
         """
-        from lidardesign.api.scores import ScoreOptions, ScoreRequest
+        from lidardesign.api.scores import ScoreRequest
 
-        options = ScoreOptions(
-            rays=rays,
-            baselines=baselines,
-            seed=seed,
-            scenes_seed=scenes_seed,
-            effects=effects,
-            detector=detector,
-            range_tolerance_mm=range_tolerance_mm,
-            return_tolerance=return_tolerance,
-            settings=settings,
-            mount_error=mount_error,
-            losses=losses,
-            workers=workers,
-            cma_seconds=cma_seconds,
-            accuracy=accuracy,
-            fail_above=fail_above,
-            fail_unless_better=fail_unless_better,
-        )
         chosen = self.designs() if designs is None else designs
         targets = [design if isinstance(design, Design) else Path(design) for design in chosen]
-        scores = ScoreRequest.resolve(targets, options, self, notes).score(progress)
-        return scores.with_accuracy(progress) if options.accuracy else scores
-
-    @names_arguments
-    def studio(self, design: Design | None = None, *, port: int | None = None) -> Any:
-        """Open a page on this machine on which sensors are moved, fitted and scored; in a notebook it is shown inside.
-
-        Arguments:
-            design: The design to begin with; the last that is saved by default.
-            port: The port to listen on; any that is free by default.
-
-        Returns:
-            The page: its `address`, `wait()` and `stop()`.
-
-        Raises:
-            ConfigError: viser is not installed, or the port is taken.
-        """
-        try:
-            # above this room, which does not depend on it
-            room = import_module("lidardesign.studio.studio")
-        except ImportError as error:
-            hint = "pip install 'lidardesign[studio]'"
-            raise ConfigError(f"the studio needs {error.name}", where="studio", hint=hint) from None
-        if port is not None:
-            check_number(port, "--port", 1, MOST_PORT, whole=True)
-        return room.Studio(self, design, port)
+        scores = ScoreRequest.resolve(targets, choices, self, notes).score(progress)
+        return scores.with_accuracy(progress) if choices.get("accuracy") else scores
 
     def __repr__(self) -> str:
         return f"<Run {self.folder}: task {self.task.name}, preset {self.config.preset}, seed {self.config.seed}>"
@@ -443,37 +303,19 @@ def open_run(folder: Path | str) -> Run:
     return Run.open(folder)
 
 
-@names_arguments
+@takes(LearnChoices)
 def learn(
     task: str | None = None,
     *,
-    preset: str | None = None,
-    out: Path | str | None = None,
-    seed: int | None = None,
-    settings: Mapping[str, Any] | Sequence[str] = (),
-    config: Path | str | None = None,
-    device: str = "auto",
-    resume: bool = False,
-    overwrite: bool = False,
-    tolerance: float | None = None,
-    time_budget_s: float | None = None,
     progress: Progress | None = None,
     notes: Notes = log_note,
+    **choices: Unpack[LearnChoices],
 ) -> Run:
     """Learn where rays are worth firing for a task, into a run folder.
 
     Arguments:
         task: The name of a task; `lidardesign tasks` lists them. By default the one that `config` names.
-        preset: Effort: draft, standard or fine.
-        out: The folder to make; runs/TASK by default.
-        seed: Seed of all random numbers.
-        settings: Settings by dotted keys, such as {"learning.steps": 60, "density.sigma_m": 0.01}.
-        config: A YAML file of settings.
-        device: auto, cpu or cuda.
-        resume: Continue an interrupted run.
-        overwrite: Replace a run that is in the folder, once the new one is learned.
-        tolerance: The setting learning.misplaced, which has to be reached: the share of mass in the wrong place.
-        time_budget_s: Steps are taken until this time has passed; measuring comes after [s].
+        choices: Those of `LearnChoices`.
         progress: Called about every tenth step with "learning", the steps done, and all steps, where that is known.
         notes: Called with every note; they are logged by default.
 
@@ -481,19 +323,7 @@ def learn(
         ConfigError: An unknown task, impossible settings, or a folder that is not empty.
         ThresholdError: The tolerance was not reached; the run is finished and can be opened.
     """
-    options = LearnOptions(
-        preset=preset,
-        out=out,
-        seed=seed,
-        settings=settings,
-        config=config,
-        device=device,
-        resume=resume,
-        overwrite=overwrite,
-        tolerance=tolerance,
-        time_budget_s=time_budget_s,
-    )
-    request = LearnRequest.resolve(task, options, notes)
+    request = LearnRequest.resolve(task, choices, notes)
     said: list[str] = []
 
     def remark(note: str) -> None:
@@ -506,7 +336,7 @@ def learn(
     result = request.run(progress and (lambda now: progress("learning", now.step, now.steps)), remark)
     for note in (*result.notes, f"the density is {result.verdict.text(request.settings.preset)}"):
         remark(note)
-    check_tolerance(result, options.tolerance)
+    check_tolerance(result, request.choices["tolerance"])
     return open_run(request.folder)
 
 

@@ -11,11 +11,13 @@ from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lidardesign.api.design import Design, collect_designs, html_table, name_apart, scoring_run, select_by_name
+from lidardesign.api.contenders import collect_designs, name_apart, scoring_run, select_by_name
+from lidardesign.api.design import Design, html_table
+from lidardesign.choices.evaluate import EvaluateChoices, NamedChoices
+from lidardesign.choices.flag import complete
 from lidardesign.config import with_task_settings
-from lidardesign.errors import MAX_SEED, ConfigError, check_number, names_arguments
+from lidardesign.errors import ConfigError, names_arguments
 from lidardesign.fitting.fit import twin_samples, twin_without_visibility
-from lidardesign.numerics import SLACK
 from lidardesign.rays.training_scenes import TrainingScenes
 from lidardesign.run.clock import Progress, outermost_clock, phase, running
 from lidardesign.run_folder import DESIGN_FOLDER, SAMPLES, Notes, RunFolder, log_note, settings_texts
@@ -28,7 +30,6 @@ from lidardesign.scoring.evaluation.mounting import MountError
 from lidardesign.scoring.evaluation.request import EvaluationRequest, numbers_alone, usual_numbers
 from lidardesign.scoring.evaluation.results import Evaluation, Paired, Row, write_csv
 from lidardesign.scoring.evaluation.score import evaluate as score_designs
-from lidardesign.sensors.sensor import MOST_RAYS
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.plan import Planner, Tolerance, parse_effects
 from lidardesign.workers import check_workers, opened_workers
@@ -37,111 +38,57 @@ if TYPE_CHECKING:
     from lidardesign.report.figures import Figure
     from lidardesign.scoring.baselines.cma import Show
 
-CMA_SECONDS = (0.1, 7 * 24 * 3600.0)
-# A picometre, and further than any sensor reaches.
-RANGE_TOLERANCES_MM = (SLACK, 1e9)
-RETURN_TOLERANCES = (SLACK, 1.0)
 MILLIMETRES = 1000.0
 COMMAND = "evaluate"
 
 
-@dataclass(frozen=True, kw_only=True)
-class ScoreOptions:
-    """A user's choices for an evaluation.
-
-    Arguments:
-        rays: Numbers of rays per frame; the task's by default, and the designs'.
-        baselines: Further baselines beside uniform, random, bounding, silhouette and greedy, by name; ["none"] leaves
-            out all of them.
-        seed: Seed of all random numbers; the run's by default.
-        effects: auto, all, none, audit, or names of effects between commas.
-        detector: The name of a detector, or its file.
-        range_tolerance_mm: Largest change of ranges by all skipped effects together [mm].
-        return_tolerance: Largest share of returns changed by all skipped effects together.
-        settings: Settings of the task to judge by other scenes than were learned.
-        workers: Processes that score scenes, or the address of a scheduler.
-        cma_seconds: Wall time of each search of the baseline cma [s].
-        accuracy: Whether the sweeps of accuracy are measured, too.
-        scenes_seed: Root of the held-out scenes; `seed` by default.
-        designs: Names of the designs that are scored; all by default.
-        mount_error: Standard deviations of mounting errors of sensors in further rows, as "5mm,0.5deg".
-        losses: Whether designs are scored with each of their sensors lost, too; those made for it always are.
-        fail_above: Limit of the designs' values, in the metric's unit, for `Scores.check`.
-        fail_unless_better: Baseline or design that every other design must be better than, likewise.
+def score_choices(given: NamedChoices) -> NamedChoices:
+    """A user's choices for an evaluation, complete.
 
     Raises:
-        ConfigError: An option out of range or unknown.
+        ConfigError: One is unknown or out of its limits, or two do not go together.
     """
-
-    rays: Sequence[int] | None = None
-    baselines: Sequence[str] = ()
-    seed: int | None = None
-    effects: str = "auto"
-    detector: str = "ideal"
-    range_tolerance_mm: float | None = None
-    return_tolerance: float | None = None
-    settings: Sequence[str] | Mapping[str, Any] = ()
-    workers: int | str = 1
-    cma_seconds: float | None = None
-    accuracy: bool = False
-    scenes_seed: int | None = None
-    designs: Sequence[str] = ()
-    mount_error: str | None = None
-    losses: bool = False
-    fail_above: float | None = None
-    fail_unless_better: str | None = None
-
-    def __post_init__(self) -> None:
-        check_workers(str(self.workers))
-        self.misplacement()
-        if NONE in self.baselines:
-            if len(self.baselines) > 1 or self.fail_unless_better in BASELINES:
-                raise ConfigError(
-                    "none beside a baseline that this or --fail-unless-better names",
-                    where="--baseline",
-                    allowed="none alone",
-                )
-        else:
-            for name in self.baselines:
-                check_baseline(name, where="--baseline")
-        limits = {
-            "cma_seconds": CMA_SECONDS,
-            "range_tolerance_mm": RANGE_TOLERANCES_MM,
-            "return_tolerance": RETURN_TOLERANCES,
-            "seed": (0, MAX_SEED),
-            "scenes_seed": (0, MAX_SEED),
-        }
-        for name, (low, high) in limits.items():
-            if getattr(self, name) is not None:
-                check_number(getattr(self, name), f"--{name.replace('_', '-')}", low, high, whole="seed" in name)
-        if self.fail_above is not None and not math.isfinite(self.fail_above):
-            raise ConfigError(f"{self.fail_above}", where="--fail-above", allowed="a finite number")
-        for count in self.rays or ():
-            check_number(count, "--rays", 1, MOST_RAYS, whole=True)
-        if self.cma_seconds is not None and CMA not in self.baselines:
+    choices = complete(NamedChoices, given)
+    check_workers(str(choices["workers"]))
+    misplacement(choices)
+    baselines, limit = choices["baselines"], choices["fail_above"]
+    if NONE in baselines:
+        if len(baselines) > 1 or choices["fail_unless_better"] in BASELINES:
             raise ConfigError(
-                "there is no search", where="--cma-seconds", hint=f"add --baseline {CMA}, or leave it out"
+                "none beside a baseline that this or --fail-unless-better names",
+                where="--baseline",
+                allowed="none alone",
             )
+    else:
+        for name in baselines:
+            check_baseline(name, where="--baseline")
+    if limit is not None and not math.isfinite(limit):
+        raise ConfigError(f"{limit}", where="--fail-above", allowed="a finite number")
+    if choices["cma_seconds"] is not None and CMA not in baselines:
+        raise ConfigError("there is no search", where="--cma-seconds", hint=f"add --baseline {CMA}, or leave it out")
+    return choices
 
-    def misplacement(self) -> MountError | None:
-        """Standard deviations of misplaced sensors in further rows; None without these."""
-        return None if self.mount_error is None else MountError.parse(self.mount_error)
 
-    def planner(self) -> tuple[Planner, bool]:
-        """The planner of effects, and True where skipped effects are audited.
+def misplacement(choices: EvaluateChoices) -> MountError | None:
+    """Standard deviations of misplaced sensors in further rows; None without these."""
+    return None if choices["mount_error"] is None else MountError.parse(choices["mount_error"])
 
-        Raises:
-            ConfigError: An unknown effect or detector.
-        """
-        audit = self.effects.strip() == "audit"
-        choice = parse_effects("auto" if audit else self.effects)
-        detector = load_detector(self.detector)
-        tolerance = Tolerance.of(detector)
-        if self.range_tolerance_mm is not None:
-            tolerance = replace(tolerance, range_m=self.range_tolerance_mm / MILLIMETRES)
-        if self.return_tolerance is not None:
-            tolerance = replace(tolerance, lost=self.return_tolerance)
-        return Planner(detector, choice, tolerance), audit
+
+def planner_of(choices: EvaluateChoices) -> tuple[Planner, bool]:
+    """The planner of effects, and True where skipped effects are audited.
+
+    Raises:
+        ConfigError: An unknown effect or detector.
+    """
+    audit = choices["effects"].strip() == "audit"
+    choice = parse_effects("auto" if audit else choices["effects"])
+    detector = load_detector(str(choices["detector"]))
+    tolerance = Tolerance.of(detector)
+    if choices["range_tolerance_mm"] is not None:
+        tolerance = replace(tolerance, range_m=choices["range_tolerance_mm"] / MILLIMETRES)
+    if choices["return_tolerance"] is not None:
+        tolerance = replace(tolerance, lost=choices["return_tolerance"])
+    return Planner(detector, choice, tolerance), audit
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +104,7 @@ class ScoreRequest:
         seed: Root of the random streams.
         planner: The detector, and how effects are chosen.
         audit: Whether all rows are scored under all effects too.
-        options: The user's choices.
+        choices: The user's choices.
     """
 
     run: RunFolder
@@ -168,13 +115,13 @@ class ScoreRequest:
     seed: int
     planner: Planner
     audit: bool
-    options: ScoreOptions
+    choices: NamedChoices
 
     @classmethod
     def resolve(
         cls,
         targets: Sequence[Design | Path],
-        options: ScoreOptions,
+        given: NamedChoices,
         judge: RunFolder | None = None,
         notes: Notes = log_note,
     ) -> ScoreRequest:
@@ -182,7 +129,7 @@ class ScoreRequest:
 
         Arguments:
             targets: Designs, design files, and run folders, which stand for all their designs.
-            options: The choices.
+            given: The choices that are given.
             judge: The run in whose scenes they are scored; by default a target without designs of its own, else the
                 one that they came from.
             notes: Called with every note.
@@ -191,31 +138,32 @@ class ScoreRequest:
             ConfigError: Runs that differ, or invalid choices.
             DataError: A design or a run is not there, or damaged.
         """
-        planner, audit = options.planner()
+        choices = score_choices(given)
+        planner, audit = planner_of(choices)
         runs = [RunFolder.open(target) for target in targets if isinstance(target, Path) and target.is_dir()]
         judge = judge or next((run for run in runs if not run.design_paths()), None)
-        designs = select_by_name(collect_designs(targets, judge, notes, options.designs), options.designs)
+        designs = select_by_name(collect_designs(targets, judge, notes, choices["designs"]), choices["designs"])
         run = learned = scoring_run(name_apart(designs), judge, notes)
         for note in learned.input_notes():
             notes(note)
-        baseline = options.fail_unless_better
+        baseline = choices["fail_unless_better"]
         _check_baseline(baseline, [design.name for design in designs])
         baselines = (
             []
-            if NONE in options.baselines
-            else [*ALWAYS, *options.baselines, *([baseline] if baseline in BASELINES else [])]
+            if NONE in choices["baselines"]
+            else [*ALWAYS, *choices["baselines"], *([baseline] if baseline in BASELINES else [])]
         )
-        rays = options.rays or usual_numbers([design.specification for design in designs], run.task.defaults.rays)
-        if options.accuracy:
+        rays = choices["rays"] or usual_numbers([design.specification for design in designs], run.task.defaults.rays)
+        if choices["accuracy"]:
             # Refuse a run that is unfinished or damaged before it is evaluated, which may take minutes
             with phase("libraries"):
                 from lidardesign.density.training.learned import check_kept
 
             check_kept(learned.folder)
-        overrides = settings_texts(options.settings)
+        overrides = settings_texts(choices["settings"])
         if overrides:
             run = replace(run, config=with_task_settings(run.task, run.config, overrides))
-        if options.range_tolerance_mm is None:
+        if choices["range_tolerance_mm"] is None:
             planner = replace(planner, tolerance=planner.tolerated.within(run.metric))
         return cls(
             run,
@@ -223,21 +171,21 @@ class ScoreRequest:
             designs,
             sorted(set(rays)),
             tuple(dict.fromkeys(baselines)),
-            run.config.seed if options.seed is None else options.seed,
+            run.config.seed if choices["seed"] is None else choices["seed"],
             planner,
             audit,
-            options,
+            choices,
         )
 
     @property
     def alone(self) -> list[int]:
         """See `EvaluationRequest`."""
-        return [] if self.options.rays else numbers_alone(self.rays, self.run.task.defaults.rays)
+        return [] if self.choices["rays"] else numbers_alone(self.rays, self.run.task.defaults.rays)
 
     @property
     def cma_seconds(self) -> float:
         """Wall time of each search of the baseline cma [s]."""
-        return DEFAULT_SECONDS if self.options.cma_seconds is None else self.options.cma_seconds
+        return DEFAULT_SECONDS if self.choices["cma_seconds"] is None else self.choices["cma_seconds"]
 
     def evaluation_request(self, searching: Show | None = None) -> EvaluationRequest:
         """The request of the scoring itself, with scenes and samples.
@@ -246,19 +194,19 @@ class ScoreRequest:
             searching: Called with how the searches of the baseline cma stand.
         """
         request = evaluation_request(
-            self.run, self.designs, self.rays, self.baselines, self.seed, self.options.scenes_seed, self.learned
+            self.run, self.designs, self.rays, self.baselines, self.seed, self.choices["scenes_seed"], self.learned
         )
         cma = CmaSettings(self.cma_seconds, show=searching)
-        misplaced = self.options.misplacement()
+        misplaced = misplacement(self.choices)
         return replace(
             request,
             planner=self.planner,
             audit=self.audit,
             cma=cma,
             mount_error=misplaced,
-            losses=self.options.losses,
+            losses=self.choices["losses"],
             alone=self.alone,
-            named=tuple(self.options.baselines),
+            named=tuple(self.choices["baselines"]),
         )
 
     def score(self, progress: Progress | None = None, searching: Show | None = None) -> Scores:
@@ -274,7 +222,7 @@ class ScoreRequest:
         """
         with nullcontext(outermost_clock()) if outermost_clock() else running() as clock:
             request = self.evaluation_request(searching)
-            workers = check_workers(str(self.options.workers))
+            workers = check_workers(str(self.choices["workers"]))
             with opened_workers(workers, request.task, len(request.test)) as starmap:
                 evaluation = score_designs(replace(request, starmap=starmap), progress=progress)
             timings = clock.timings()
@@ -322,7 +270,7 @@ class Scores:
 
     def as_dict(self) -> dict[str, Any]:
         """The document of `lidardesign evaluate --json`."""
-        return {**self.evaluation.as_dict(), "set": list(settings_texts(self.request.options.settings))}
+        return {**self.evaluation.as_dict(), "set": list(settings_texts(self.request.choices["settings"]))}
 
     def check(self) -> None:
         """Check the designs against the thresholds of the request.
@@ -337,7 +285,7 @@ class Scores:
         """The entry of the run's manifest: the scores of the designs that lie in the run."""
         folder = (self.run.folder / DESIGN_FOLDER).resolve()
         files = {one.name: one.path for one in self.request.designs if one.path and one.path.resolve().parent == folder}
-        return {SCORES: last_scores_of(self.evaluation, files, settings_texts(self.request.options.settings))}
+        return {SCORES: last_scores_of(self.evaluation, files, settings_texts(self.request.choices["settings"]))}
 
     def with_accuracy(self, progress: Progress | None = None) -> Scores:
         """The scores, with what accuracy costs on this machine; takes minutes.
@@ -413,11 +361,11 @@ class Scores:
 
 def check_scores(scores: Scores) -> None:
     """As `Scores.check`, with errors in terms of command-line options."""
-    options = scores.request.options
-    if options.fail_above is not None:
-        check_limit(scores.evaluation, options.fail_above)
-    if options.fail_unless_better is not None:
-        check_better(scores.evaluation, options.fail_unless_better)
+    choices = scores.request.choices
+    if choices["fail_above"] is not None:
+        check_limit(scores.evaluation, choices["fail_above"])
+    if choices["fail_unless_better"] is not None:
+        check_better(scores.evaluation, choices["fail_unless_better"])
     check_audit(scores.evaluation)
 
 

@@ -11,11 +11,13 @@ from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import reduce
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 from lidardesign.api.design import Design
-from lidardesign.api.scores import ScoreOptions, ScoreRequest, Scores
-from lidardesign.errors import ConfigError, DataError, names_arguments, pasted
+from lidardesign.api.scores import ScoreRequest, Scores, score_choices
+from lidardesign.choices.evaluate import NamedChoices
+from lidardesign.choices.flag import takes
+from lidardesign.errors import ConfigError, DataError, pasted
 from lidardesign.formats.designs import read_design
 from lidardesign.run.clock import Progress, outermost_clock, running
 from lidardesign.run_folder import Notes, RunFolder, log_note
@@ -46,47 +48,19 @@ def differing_seeds(targets: Sequence[Path], notes: Notes = log_note) -> list[Ru
     return runs if other is None and len(seeds) > 1 else []
 
 
-@names_arguments
+@takes(NamedChoices)
 def evaluate_seeds(
     runs: Sequence[RunFolder | Path | str],
     *,
-    designs: Sequence[str] = (),
-    rays: Sequence[int] | None = None,
-    baselines: Sequence[str] = (),
-    scenes_seed: int | None = None,
-    effects: str = "auto",
-    detector: str = "ideal",
-    range_tolerance_mm: float | None = None,
-    return_tolerance: float | None = None,
-    settings: Sequence[str] | Mapping[str, Any] = (),
-    mount_error: str | None = None,
-    losses: bool = False,
-    workers: int | str = 1,
-    cma_seconds: float | None = None,
-    fail_above: float | None = None,
-    fail_unless_better: str | None = None,
     progress: Progress | None = None,
     notes: Notes = log_note,
+    **choices: Unpack[NamedChoices],
 ) -> Scores:
     """Score the designs that have the same name in all runs, over seeds and held-out scenes.
 
     Arguments:
         runs: Two or more runs of one task that differ only in their seed, or their folders.
-        designs: Names of designs; all that the runs have in common by default.
-        rays: Numbers of rays per frame; the task's by default.
-        baselines: Further baselines, as of `Run.evaluate`.
-        scenes_seed: Seed of the held-out scenes; the first run's by default.
-        effects: Physical effects: "auto", "all", "none" or names separated by commas.
-        detector: The name of a detector, or a YAML file.
-        range_tolerance_mm: Largest change of ranges by all skipped effects together [mm].
-        return_tolerance: Largest share of returns changed by all skipped effects together.
-        settings: Settings of the task, to score in scenes other than the learned ones.
-        mount_error: Standard deviations of mounting errors of sensors in further rows, as "5mm,0.5deg".
-        losses: Whether designs are scored with each of their sensors lost, too; those made for it always are.
-        workers: Processes that score scenes, or the address of a dask scheduler, tcp://HOST:PORT.
-        cma_seconds: Wall time of each search of the baseline cma [s].
-        fail_above: Limit of the designs' values, in the metric's unit, for `Scores.check()`.
-        fail_unless_better: Baseline or design that every other design must be better than, likewise.
+        choices: Those of `NamedChoices`, but for a seed, accuracy and audits.
         progress: Called with the name of the scene, the scenes done, and all scenes.
         notes: Called with every note.
 
@@ -95,24 +69,7 @@ def evaluate_seeds(
         DataError: A run is missing or damaged.
     """
     opened = [run if isinstance(run, RunFolder) else RunFolder.open(run) for run in runs]
-    options = ScoreOptions(
-        designs=designs,
-        rays=rays,
-        baselines=baselines,
-        scenes_seed=scenes_seed,
-        effects=effects,
-        detector=detector,
-        range_tolerance_mm=range_tolerance_mm,
-        return_tolerance=return_tolerance,
-        settings=settings,
-        mount_error=mount_error,
-        losses=losses,
-        workers=workers,
-        cma_seconds=cma_seconds,
-        fail_above=fail_above,
-        fail_unless_better=fail_unless_better,
-    )
-    return SeedsRequest.resolve(opened, options, notes).score(progress)
+    return SeedsRequest.resolve(opened, choices, notes).score(progress)
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,31 +83,29 @@ class SeedsRequest:
     requests: Sequence[ScoreRequest]
 
     @classmethod
-    def resolve(cls, runs: Sequence[RunFolder], options: ScoreOptions, notes: Notes = log_note) -> SeedsRequest:
+    def resolve(cls, runs: Sequence[RunFolder], given: NamedChoices, notes: Notes = log_note) -> SeedsRequest:
         """The request of a user's choices.
 
         Arguments:
             runs: Runs that differ in their seed alone.
-            options: The choices.
+            given: The choices that are given.
             notes: Called with every note.
 
         Raises:
             ConfigError: Runs that differ in more than their seed, a run given twice, or no design of one name.
             DataError: A run has no designs, or one cannot be read.
         """
+        choices = score_choices(given)
         _check_runs(runs)
-        _check_options(options)
-        names = _common_names(runs, options.designs)
+        _check_choices(choices)
+        names = _common_names(runs, choices["designs"])
         designs = [
             [Design(read_design(path, notes), run, path) for path in map(run.design_path, names)] for run in runs
         ]
         every = [design.specification for of_run in designs for design in of_run]
-        shared = replace(
-            options,
-            designs=(),
-            rays=options.rays or usual_numbers(every, runs[0].task.defaults.rays),
-            scenes_seed=runs[0].config.seed if options.scenes_seed is None else options.scenes_seed,
-        )
+        scenes_seed = runs[0].config.seed if choices["scenes_seed"] is None else choices["scenes_seed"]
+        rays = choices["rays"] or usual_numbers(every, runs[0].task.defaults.rays)
+        shared: NamedChoices = {**choices, "designs": (), "rays": rays, "scenes_seed": scenes_seed}
         return cls(
             [ScoreRequest.resolve(of_run, shared, run, notes) for of_run, run in zip(designs, runs, strict=True)]
         )
@@ -189,7 +144,7 @@ class SeedsRequest:
     @property
     def _scenes_seed(self) -> int:
         request = self.requests[0]
-        return request.seed if request.options.scenes_seed is None else request.options.scenes_seed
+        return request.seed if request.choices["scenes_seed"] is None else request.choices["scenes_seed"]
 
 
 def _check_runs(runs: Sequence[RunFolder]) -> None:
@@ -229,13 +184,14 @@ def _flat(document: Mapping[str, Any], front: str = "") -> dict[str, Any]:
     return flat
 
 
-def _check_options(options: ScoreOptions) -> None:
-    if options.seed is not None:
+def _check_choices(choices: NamedChoices) -> None:
+    if choices["seed"] is not None:
         raise ConfigError(
             "every run has its own seed", where="--seed", hint="--scenes-seed chooses the held-out scenes"
         )
-    for option, given in (("--accuracy", options.accuracy), ("--effects audit", options.effects.strip() == "audit")):
-        if given:
+    audits = choices["effects"].strip() == "audit"
+    for option, is_given in (("--accuracy", choices["accuracy"]), ("--effects audit", audits)):
+        if is_given:
             raise ConfigError("it works on one run", where=option, hint="give one run, or leave it out")
 
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 
 from lidardesign import __version__
+from lidardesign.choices.flag import Flag
 from lidardesign.cli.commands.capture import capture
 from lidardesign.cli.commands.catalog import catalog_app
 from lidardesign.cli.commands.config import config_app
@@ -21,7 +22,7 @@ from lidardesign.cli.commands.show import show
 from lidardesign.cli.commands.simulate import simulate
 from lidardesign.cli.commands.studio import studio
 from lidardesign.cli.commands.tasks import tasks_app
-from lidardesign.cli.terminal.options import StrictCommand
+from lidardesign.cli.terminal.options import StrictCommand, typer_option
 from lidardesign.cli.terminal.output import (
     EXIT_BROKEN_PIPE,
     Output,
@@ -39,7 +40,7 @@ from lidardesign.run.processes import ENDING
 PROGRAM = "lidardesign"
 COMPLETION = "_LIDARDESIGN_COMPLETE"
 EXIT_USAGE = 2
-VERSION_HELP = "Print the version; with --json those of Python and the libraries too."
+VERSION = Flag("--version", "", "Print the version; with --json those of Python and the libraries too.", default=False)
 SETTINGS = {"help_option_names": ["-h", "--help"]}
 
 # What `--help` of a command ends with: every example is parsed by the tests.
@@ -156,9 +157,7 @@ def _print_version(wanted: bool) -> None:
 
 @app.callback()
 def program(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help=VERSION_HELP)
-    ] = False,
+    version: typer_option(VERSION, callback=_print_version, is_eager=True) = False,
 ) -> None:
     """Declare the options of the program itself; the typer object carries its help."""
 

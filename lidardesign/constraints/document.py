@@ -30,6 +30,7 @@ from typing import Annotated, Any, Literal
 from pydantic import ConfigDict, Field, model_validator
 
 from lidardesign.errors import UNSET_HINT, ConfigError
+from lidardesign.limits import MOST_FITTED, MOST_RAYS
 from lidardesign.run.validation import (
     apply_override,
     check_model,
@@ -41,7 +42,6 @@ from lidardesign.run.yaml import Document, KeyPath, leaves, load_yaml, merged
 from lidardesign.run_folder import Notes, log_note
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design_file import Distance, StrictKeys, Vector
-from lidardesign.sensors.sensor import MOST_RAYS
 from lidardesign.space import FARTHEST_M, MOST_TURNS, SHORTEST_M
 from lidardesign.task import Task
 
@@ -51,8 +51,6 @@ Angle = Annotated[float, Field(ge=-360 * MOST_TURNS, le=360 * MOST_TURNS)]
 # The boxes between excluded ones grow faster than their number: with so many a fit still takes seconds.
 MOST_EXCLUDED = 32
 MOST_ROLL_DEG = 45.0  # of a fitted field of view: beyond it is the same with its two angles exchanged
-# Responsibilities of so many sensors over all samples fill some 100 MB.
-MOST_FITTED = 1000
 Count = Annotated[int, Field(ge=1, le=MOST_FITTED)]
 
 

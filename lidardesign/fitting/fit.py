@@ -28,7 +28,8 @@ from lidardesign.constraints.feasibility import check_feasible
 from lidardesign.constraints.origins import placement_notes
 from lidardesign.errors import BackgroundNote, DataError, InfeasibleError
 from lidardesign.fitting.options import BEST
-from lidardesign.fitting.request import COUNTS, KEY, WORLD, FitRequest, FitResult, RunTarget, Weighting, check_several
+from lidardesign.fitting.request import COUNTS, KEY, WORLD, FitRequest, RunTarget, Weighting, check_several
+from lidardesign.fitting.result import FitResult
 from lidardesign.formats.designs import relative_folder
 from lidardesign.mixture.fit import FitProblem, FittedSensors, fit_sensors
 from lidardesign.mixture.support import LEAST_SAMPLES, MOVED_SAMPLES, Retarget, at_condition, condition_text

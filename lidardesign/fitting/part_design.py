@@ -33,7 +33,8 @@ from lidardesign.fitting.part_shapes import (
     parts_inform,
     shapes_of,
 )
-from lidardesign.fitting.request import FitRequest, FitResult
+from lidardesign.fitting.request import FitRequest
+from lidardesign.fitting.result import FitResult
 from lidardesign.fitting.trials import HeldBackScenes, Trial, best_of
 from lidardesign.mixture.bounds import bounds_of, clip_azimuth
 from lidardesign.mixture.components import Axes

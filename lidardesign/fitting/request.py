@@ -1,4 +1,4 @@
-"""A fit: its request, its result, and the target density that it fits to.
+"""A fit: its request, and the target density that it fits to.
 
 The choices of a user are resolved by the run, an earlier design, constraints and a rig; settings of the task may weight
 the run's samples and its target density.
@@ -8,21 +8,27 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lidardesign.choices.fit import BEST, LEAST
 from lidardesign.config import with_task_settings
-from lidardesign.constraints.check import ConstraintCheck
 from lidardesign.constraints.document import Constraints, load_constraints
 from lidardesign.constraints.feasibility import unit_notes
 from lidardesign.constraints.origins import is_mounted, origin_box, snap_to_space
 from lidardesign.errors import ConfigError, InfeasibleError
-from lidardesign.estimates import Estimate, as_documents
-from lidardesign.fitting.options import BEST, LEAST, FitOptions, check_goal, check_layout, refuse_first
+from lidardesign.fitting.options import (
+    DesignChoices,
+    check_goal,
+    check_layout,
+    fit_choices,
+    refuse_first,
+    sensor_numbers,
+)
 from lidardesign.formats.designs import reach_of, read_design
 from lidardesign.formats.rig import moved_notes, rig_constraints, rig_notes
 from lidardesign.rays.information import informs_rays
@@ -100,7 +106,7 @@ class FitRequest:
     def resolve(
         cls,
         run: RunFolder,
-        options: FitOptions,
+        given: DesignChoices,
         base: DesignSpec | None = None,
         *,
         notes: Notes = log_note,
@@ -109,7 +115,7 @@ class FitRequest:
 
         Arguments:
             run: The run.
-            options: The choices.
+            given: The choices that are given.
             base: An earlier design, which says what the user does not.
             notes: Called with every note.
 
@@ -118,37 +124,39 @@ class FitRequest:
             DataError: The rig cannot be read.
             InfeasibleError: The rig stands where the run's sensors may not.
         """
+        choices = fit_choices(given)
+        numbers = sensor_numbers(choices["sensors"])
         for note in run.input_notes():
             notes(note)
-        asked = load_constraints(options.constraints, notes=notes)
+        asked = load_constraints(choices["constraints"], notes=notes)
         if asked is None and base is not None:
             asked = Constraints()
-        given = None if asked is None or asked.parts is None else asked.parts.names
-        if options.parts is not None and given not in (None, "catalog", options.parts):
-            notes(f"--parts takes the place of parts.names: {', '.join(given)}")
-        constraints, names = _with_rig(options, _with_survival(options, _with_parts(options, asked, run)), run, notes)
+        named = None if asked is None or asked.parts is None else asked.parts.names
+        if choices["parts"] is not None and named not in (None, "catalog", choices["parts"]):
+            notes(f"--parts takes the place of parts.names: {', '.join(named)}")
+        constraints, names = _with_rig(choices, _with_survival(choices, _with_parts(choices, asked, run)), run, notes)
         rules, moved = snap_to_space(constraints or Constraints(), run.config.space)
         for note in (*moved, *unit_notes(asked or Constraints(), run.config.space)):
             notes(note)
-        layout = _layout(rules, base, run, options)
-        check_layout(layout, rules, run, options)
-        if options.numbers and (rules.parts is None or options.goal is not None):
+        layout = _layout(rules, base, run, choices)
+        check_layout(layout, rules, run, choices)
+        if numbers and (rules.parts is None or choices["goal"] is not None):
             fault = "together with a goal" if rules.parts else "without parts"
             raise ConfigError(f"several numbers of sensors {fault}", where="--sensors", allowed=f"N, or {BEST}")
-        sensors = _sensors(options.numbers[-1] if options.numbers else options.sensors, rules, base, layout)
+        sensors = _sensors(numbers[-1] if numbers else choices["sensors"], rules, base, layout)
         most = sensors if isinstance(sensors, int) else rules.sensors.max or math.inf
         if rules.survive:
             check_several(most)
-        check_goal(layout, rules, run, options)
-        at = {**(base.at if base else {}), **options.at}
+        check_goal(layout, rules, run, choices)
+        at = {**(base.at if base else {}), **choices["at"]}
         space = run.config.space.at(at)
         if layout != "spinning" and rules.parts is None:
             _check_conditions(rules, space)
-        weights = settings_texts(options.weights)
+        weights = settings_texts(choices["weights"])
         weighting = Weighting(weights) if weights or base is None else Weighting.of(base)
         if weighting.settings:
             with_task_settings(run.task, run.config, weighting.settings, option=weighting.origin)
-        detector, settings = _world(options, base)
+        detector, settings = _world(choices, base)
         if settings:
             with_task_settings(run.task, run.config, settings)
         if detector is not None:
@@ -156,33 +164,33 @@ class FitRequest:
             from lidardesign.simulate.detector.files import load_detector
 
             load_detector(detector)
-            if rules.parts is None and (layout == "spinning" or (sensors != BEST and options.goal is None)):
+            if rules.parts is None and (layout == "spinning" or (sensors != BEST and choices["goal"] is None)):
                 notes(f"{detector} judges sets of parts and numbers of sensors, and none are tried here")
-        channels = options.channels
+        channels = choices["channels"]
         if layout == "spinning" and channels is None and base is not None:
             channels = base.provenance.get("channels")
         return cls(
             run=run,
-            name=options.name or ("fit" if asked is None else "constrained"),
-            seed=run.config.seed if options.seed is None else options.seed,
+            name=choices["name"] or ("fit" if asked is None else "constrained"),
+            seed=run.config.seed if choices["seed"] is None else choices["seed"],
             constraints=rules,
             is_constrained=constraints is not None,
             at=at,
             sensors=sensors,
             layout=layout,
-            rays=_rays(options.rays, rules, base),
-            gates=_gates(options.gates, base, space, layout),
-            level=_level(options.level, base, run, layout),
+            rays=_rays(choices["rays"], rules, base),
+            gates=_gates(choices["gates"], base, space, layout),
+            level=_level(choices["level"], base, run, layout),
             weighting=weighting,
             channels=channels,
             names=names,
-            certify=options.certify,
+            certify=choices["certify"],
             detector=detector,
             settings=settings,
-            fewest=None if options.numbers is None else options.numbers[0],
-            goal=options.goal,
-            least=options.least or ("bandwidth" if rules.parts is None else "parts"),
-            adaptive=_patterns(options, base, run, layout, rules),
+            fewest=None if numbers is None else numbers[0],
+            goal=choices["goal"],
+            least=choices["least"] or ("bandwidth" if rules.parts is None else "parts"),
+            adaptive=_patterns(choices, base, run, layout, rules),
         )
 
     @property
@@ -243,28 +251,28 @@ class Weighting:
         return cls(tuple(settings), f"{where}: set")
 
 
-def _layout(constraints: Constraints, base: DesignSpec | None, run: RunFolder, options: FitOptions) -> LayoutName:
+def _layout(constraints: Constraints, base: DesignSpec | None, run: RunFolder, choices: DesignChoices) -> LayoutName:
     """The user's layout, else the design's, else `chosen` for tasks with `informs` and `even` for others."""
-    if options.layout is not None:
-        return options.layout
+    if choices["layout"] is not None:
+        return choices["layout"]
     if constraints.parts is not None:
         return "even"
     if base is not None and base.layout in FITTED_LAYOUTS:
         return base.layout
-    return "chosen" if informs_rays(run.task) and options.like is None else "even"
+    return "chosen" if informs_rays(run.task) and choices["like"] is None else "even"
 
 
 def _patterns(
-    options: FitOptions, base: DesignSpec | None, run: RunFolder, layout: LayoutName, rules: Constraints
+    choices: DesignChoices, base: DesignSpec | None, run: RunFolder, layout: LayoutName, rules: Constraints
 ) -> int:
     """The user's largest number of patterns that follow what they see, else the design's; 1 for none.
 
     Raises:
         ConfigError: The rays follow a condition already.
     """
-    most = options.adaptive
+    most = choices["adaptive"]
     if most is None:
-        adaptive = None if base is None or layout != "chosen" or rules.survive or options.goal else base.adaptive
+        adaptive = None if base is None or layout != "chosen" or rules.survive or choices["goal"] else base.adaptive
         most = 1 if adaptive is None else len(adaptive.patterns) - 1
     if most > 1 and run.config.space.conditioned:
         names = " and ".join(DIMENSIONS[axis] for axis in run.config.space.conditioned)
@@ -298,39 +306,41 @@ def _check_conditions(constraints: Constraints, space: DesignSpace) -> None:
 
 
 def _with_rig(
-    options: FitOptions, asked: Constraints | None, run: RunFolder, notes: Notes
+    choices: DesignChoices, asked: Constraints | None, run: RunFolder, notes: Notes
 ) -> tuple[Constraints | None, tuple[str, ...]]:
     """Constraints completed by those of a rig, and the names of its sensors; unchanged without a rig."""
-    if options.like is None:
+    if choices["like"] is None:
         return asked, ()
-    rig = read_design(Path(options.like), notes, reach_of([run]))
+    rig = read_design(Path(choices["like"]), notes, reach_of([run]))
     own, space = Constraints() if asked is None else asked, run.config.space
     keys = " / ".join(key for key in PLACE_KEYS if key in type(run.config.task).model_fields)
     keys = keys or "the keys x_m, y_m and z_m of its space"
     hint = f"learn with {keys} for the rig's places: lidardesign tasks show {run.task.name}"
-    constraints = rig_constraints(rig, space, own, rays=options.rays, hint=hint)
+    constraints = rig_constraints(rig, space, own, rays=choices["rays"], hint=hint)
     for line in (*rig_notes(rig, constraints, own), *moved_notes(rig, space, constraints)):
         notes(line)
     return constraints, tuple(sensor.name for sensor in rig.sensors)
 
 
-def _with_parts(options: FitOptions, asked: Constraints | None, run: RunFolder) -> Constraints | None:
+def _with_parts(choices: DesignChoices, asked: Constraints | None, run: RunFolder) -> Constraints | None:
     """The constraints with the parts that a user named, checked."""
-    if options.parts is not None:
+    if choices["parts"] is not None:
         document = {} if asked is None else asked.as_document()
-        asked = Constraints.from_mapping({**document, "parts": {**document.get("parts", {}), "names": options.parts}})
+        asked = Constraints.from_mapping(
+            {**document, "parts": {**document.get("parts", {}), "names": choices["parts"]}}
+        )
     if asked is None or asked.parts is None:
         return asked
     from lidardesign.parts.catalogue import named_parts
 
     named_parts(asked.parts.names, asked.parts.each)
     lacking = {
-        "the number of parts is missing": not isinstance(options.sensors, int)
-        and not options.numbers
+        "the number of parts is missing": not isinstance(choices["sensors"], int)
+        and not sensor_numbers(choices["sensors"])
         and asked.parts.count is None,
-        "parts together with --at or --weight": options.at or options.weights,
-        f"parts in the layout {options.layout}": options.layout,
-        "parts with --gates: a part's gates are fixed": options.gates,
+        "parts together with --at or --weight": choices["at"] or choices["weights"],
+        f"parts in the layout {choices['layout']}": choices["layout"],
+        "parts with --gates: a part's gates are fixed": choices["gates"],
         f"the task {run.task.name} has no method informs": not informs_rays(run.task),
     }
     allowed = "--parts NAME,NAME --sensors N, or parts.names, parts.count; without --layout or --gates"
@@ -338,12 +348,12 @@ def _with_parts(options: FitOptions, asked: Constraints | None, run: RunFolder) 
     return asked
 
 
-def _with_survival(options: FitOptions, asked: Constraints | None) -> Constraints | None:
+def _with_survival(choices: DesignChoices, asked: Constraints | None) -> Constraints | None:
     """The constraints with the user's word on sensors that may fail."""
-    if options.survive is None or (asked is None and not options.survive):
+    if choices["survive"] is None or (asked is None and not choices["survive"]):
         return asked
     document = {} if asked is None else asked.as_document()
-    return Constraints.from_mapping({**document, "survive": options.survive})
+    return Constraints.from_mapping({**document, "survive": choices["survive"]})
 
 
 def check_several(sensors: float) -> None:
@@ -406,7 +416,7 @@ def _usual_level(run: RunFolder, layout: LayoutName) -> float:
     return CHOSEN_LEVEL if layout == "chosen" else run.task.defaults.level
 
 
-def _world(options: FitOptions, base: DesignSpec | None) -> tuple[str | None, tuple[str, ...]]:
+def _world(choices: DesignChoices, base: DesignSpec | None) -> tuple[str | None, tuple[str, ...]]:
     """The user's detector and settings of scenes, each else as for the design.
 
     Raises:
@@ -415,60 +425,9 @@ def _world(options: FitOptions, base: DesignSpec | None) -> tuple[str | None, tu
     known = {} if base is None else base.provenance.get(WORLD, {})
     if not isinstance(known, Mapping) or not isinstance(known.get("set", []), list | tuple):
         raise ConfigError(f"holds {known!r}", where=f"{WORLD} of design {base.name}", hint=FIT_AGAIN)
-    detector = known.get("detector") if options.detector is None else options.detector
-    settings = settings_texts(options.settings) or tuple(map(str, known.get("set", [])))
+    detector = known.get("detector") if choices["detector"] is None else choices["detector"]
+    settings = settings_texts(choices["settings"]) or tuple(map(str, known.get("set", [])))
     return None if detector is None else str(detector), settings
-
-
-@dataclass(frozen=True, eq=False)
-class FitResult:
-    """A fitted design with its quality and checks.
-
-    Arguments:
-        design: The design.
-        log_likelihood: Weighted mean log density of the samples [nats]; None where it was chosen on scenes alone.
-        admissible_mass: The share of the density inside the constraints; None with fixed origins, or likewise.
-        ess: Effective share of the samples that were admitted, or of all where it was chosen on scenes alone, 0 to 1.
-        seconds: Wall time [s].
-        constraints: The independent checks.
-        notes: Lines on sensors.
-        numbers: By number of parts, where several were asked for: their names, score, power and price.
-        error_estimates: Standard errors of log_likelihood, ess and admissible_mass.
-        goal: For a goal, what was tried, as plain values.
-    """
-
-    design: DesignSpec
-    log_likelihood: float | None
-    admissible_mass: float | None
-    ess: float
-    seconds: float
-    constraints: tuple[ConstraintCheck, ...] = ()
-    notes: tuple[str, ...] = ()
-    numbers: tuple[Mapping[str, Any], ...] = ()
-    error_estimates: Mapping[str, Estimate] = field(default_factory=dict)
-    goal: Mapping[str, Any] | None = None
-
-    @property
-    def satisfied(self) -> bool:
-        """True where every constraint holds on the finished design."""
-        return all(check.satisfied for check in self.constraints)
-
-    def as_dict(self) -> dict[str, Any]:
-        """The contract's JSON keys; the path of the design is for the caller to fill."""
-        return {
-            "design": self.design.name,
-            "frame": self.design.mount or "world",
-            "sensors": [sensor.as_dict() for sensor in self.design.sensors],
-            "log_likelihood": self.log_likelihood,
-            "admissible_mass": self.admissible_mass,
-            "ess": self.ess,
-            "satisfied": self.satisfied,
-            "constraints": [check.as_dict() for check in self.constraints],
-            "seconds": self.seconds,
-            "error_estimates": as_documents(self.error_estimates),
-            **({"numbers": [dict(row) for row in self.numbers]} if self.numbers else {}),
-            **({} if self.goal is None else {"goal": dict(self.goal)}),
-        }
 
 
 class RunTarget:

@@ -21,7 +21,7 @@ from lidardesign.constraints.feasibility import check_feasible
 from lidardesign.constraints.origins import inside_excluded, mounts_of, origin_box
 from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.fitting.options import refuse_first
-from lidardesign.fitting.request import FitResult
+from lidardesign.fitting.result import FitResult
 from lidardesign.numerics import FULL_TURN
 from lidardesign.rays import information
 from lidardesign.rays.certificate import certificate_document, certify

@@ -297,7 +297,7 @@ def grid_of(mount: Mount) -> EvenGrid:
 
 def channel_mounts(design: DesignSpec, rays: Rays) -> tuple[DesignSpec, Rays, list[Mount]]:
     """A design, its rays and mounts; spinning sensors are split into one per channel, whose ring is an even grid."""
-    if design.layout != "spinning":
+    if not design.spins:
         return design, rays, mounts(design, rays)
     rings = np.column_stack([rays.sensor, rays.elevation_rad])
     found, channel = np.unique(rings, axis=0, return_inverse=True)
@@ -315,7 +315,7 @@ def grid_sensor_losses(design: DesignSpec, mounted: Sequence[Mount], rays: Rays)
         *origin_losses(mounted),
         *gate_losses(mounted),
     ]
-    if design.layout == "spinning":
+    if design.spins:
         notes.append("every channel is a sensor of its own: an even ring")
     return [*notes, "firing times are lost"]
 

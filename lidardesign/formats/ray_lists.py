@@ -22,6 +22,7 @@ import numpy as np
 
 from lidardesign.errors import DataError
 from lidardesign.formats.rig import MOST_SENSORS, Rig, RigSensor, number_of
+from lidardesign.limits import MOST_RAYS
 from lidardesign.numerics import COARSE_SLACK, SLACK
 from lidardesign.run.arrays import NUMERIC_KINDS, csv_rows, csv_table, read_npz
 from lidardesign.run.files import write_atomic
@@ -29,7 +30,7 @@ from lidardesign.run.inputs import RAY_TABLE
 from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design import DesignSpec
-from lidardesign.sensors.sensor import DEFAULT_LEVEL, MOST_RAYS, Sensor, interval_factor
+from lidardesign.sensors.sensor import DEFAULT_LEVEL, Sensor, interval_factor
 from lidardesign.space import FULL_TURN, MOST_TURNS, angles, direction
 
 ORIGIN = ("origin_x_m", "origin_y_m", "origin_z_m")

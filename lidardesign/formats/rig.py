@@ -18,9 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from lidardesign.constraints.document import MOST_FITTED, Constraints, SensorConstraints
+from lidardesign.constraints.document import Constraints, SensorConstraints
 from lidardesign.constraints.origins import axes_outside, place_text, snap_place_to_space
 from lidardesign.errors import ConfigError, DataError, InfeasibleError, pasted
+from lidardesign.limits import MOST_FITTED, MOST_RAYS
 from lidardesign.numerics import SLACK
 from lidardesign.run.validation import is_name
 from lidardesign.run.yaml import merged, plain_number
@@ -29,7 +30,6 @@ from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.pattern import Pattern
 from lidardesign.sensors.sensor import (
     DEFAULT_LEVEL,
-    MOST_RAYS,
     Sensor,
     boresight_frame,
     interval_factor,

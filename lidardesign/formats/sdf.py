@@ -22,10 +22,11 @@ import numpy as np
 
 from lidardesign.errors import DataError
 from lidardesign.formats.rig import MOST_SENSORS, Aim, Rig, RigSensor
+from lidardesign.limits import MOST_RAYS
 from lidardesign.run.xml import Element, numbers_of, read_xml
 from lidardesign.scenes.rays import rotation_of_quaternion, rotation_of_rpy
 from lidardesign.scenes.scene import inverse_rigid, rigid
-from lidardesign.sensors.sensor import MOST_RAYS, boresight_frame, boresight_of
+from lidardesign.sensors.sensor import boresight_frame, boresight_of
 from lidardesign.space import FULL_TURN, angles, direction
 
 MODEL_FRAME, WORLD_FRAME = "__model__", "world"

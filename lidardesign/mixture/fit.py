@@ -14,11 +14,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidardesign.constraints.document import MOST_FITTED, Constraints, SensorRules, rules_of
+from lidardesign.constraints.document import Constraints, SensorRules, rules_of
 from lidardesign.constraints.feasibility import BandwidthBudget, affordable_bins, check_feasible, most_rays
 from lidardesign.constraints.origins import fix_origins, is_mounted, most_mounted
 from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.estimates import Estimate, effective_share_error
+from lidardesign.limits import MOST_FITTED
 from lidardesign.mixture.bounds import bounds_of, sensor_groups
 from lidardesign.mixture.components import Axes, Features, log_density, responsibilities
 from lidardesign.mixture.em import LEAST_SAMPLES

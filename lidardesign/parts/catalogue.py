@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from lidardesign.errors import ConfigError, page
+from lidardesign.limits import MOST_RAYS
 from lidardesign.parts.part import Part
 from lidardesign.parts.statements import PartFile
 from lidardesign.run.clock import phase
@@ -26,7 +27,7 @@ from lidardesign.run.yaml import load_yaml
 from lidardesign.scenes.rays import DEFAULT_RATE_HZ, Rays
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.pattern import Pattern, even_subset, grid_rows, grid_tangent
-from lidardesign.sensors.sensor import MOST_RAYS, Sensor, boresight_frame, boresight_of
+from lidardesign.sensors.sensor import Sensor, boresight_frame, boresight_of
 from lidardesign.space import FARTHEST_M
 
 FOLDER = Path(__file__).parent / "files"

@@ -11,8 +11,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
+from lidardesign.limits import MOST_RAYS
 from lidardesign.sensors.design_file import StrictKeys, check_name
-from lidardesign.sensors.sensor import MOST_RAYS
 
 # In whatever unit a figure has: what is beyond is a slip.
 LARGEST = 1e12

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidardesign.errors import ConfigError
+from lidardesign.limits import MOST_RAYS
 from lidardesign.numerics import SLACK
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import SPEED_OF_LIGHT_M_S
-from lidardesign.sensors.sensor import MOST_RAYS
 
 SECONDS_PER_PICOSECOND = 1e-12
 BITS_PER_MEGABIT = 1e6

@@ -82,6 +82,11 @@ class DesignSpec:
         return [len(pattern) for pattern in self.patterns] if self.layout == "chosen" else None
 
     @property
+    def spins(self) -> bool:
+        """True where its sensors spin: every channel is a ring."""
+        return self.layout == "spinning"
+
+    @property
     def size(self) -> int | None:
         """The number of rays of its fixed pattern, of which it may fire an even subset; None where it has none."""
         return None if self.layout in ("chosen", "even") else self.count

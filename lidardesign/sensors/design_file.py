@@ -15,6 +15,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from lidardesign.errors import ConfigError, page
+from lidardesign.limits import LEVELS
 from lidardesign.numerics import COARSE_SLACK, SLACK
 from lidardesign.run.files import write_atomic
 from lidardesign.run.validation import check_model, is_name, placed_at
@@ -22,7 +23,7 @@ from lidardesign.run.yaml import dump_yaml
 from lidardesign.sensors.adaptive import AdaptivePatterns, PatternRule
 from lidardesign.sensors.design import DesignSpec, LayoutName
 from lidardesign.sensors.pattern import Pattern
-from lidardesign.sensors.sensor import DEFAULT_LEVEL, LEVELS, Sensor
+from lidardesign.sensors.sensor import DEFAULT_LEVEL, Sensor
 from lidardesign.space import DIMENSIONS, FARTHEST_M, FULL_TURN, LARGEST_ANGLE_RAD
 
 SCHEMA_VERSION = 2

@@ -22,10 +22,6 @@ from lidardesign.numerics import sphere_exp, sphere_log
 from lidardesign.space import angles, direction
 
 DEFAULT_LEVEL = 0.95
-# Beyond these an interval holds almost none or almost all of a normal distribution.
-LEVELS = (0.01, 0.999999)
-# Returns of so many fill some 100 MB per scene; no scanner fires more in a frame.
-MOST_RAYS = 1_000_000
 
 
 def interval_factor(level: float) -> float:

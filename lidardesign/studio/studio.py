@@ -22,7 +22,7 @@ from lidardesign.clouds.seen import SeenScene
 from lidardesign.constraints.origins import SAME_PLACE_M, place_text
 from lidardesign.errors import BackgroundNote, ConfigError, LidardesignError
 from lidardesign.estimates import Interval, figure_and_interval
-from lidardesign.fitting.options import FitOptions
+from lidardesign.fitting.options import check_name
 from lidardesign.formats.registry import EXPORTERS
 from lidardesign.parts.catalogue import load_library
 from lidardesign.report.figures import OUTCOME_WORDS
@@ -396,7 +396,7 @@ class Studio:
 
     def _on_save(self, _: Any) -> None:
         name, choices, folder = str(self._panel.name.value).strip(), self.choices, self.run.folder
-        FitOptions(name=name)  # refuses what no design may be called
+        check_name(name)
         if choices.state != "fitted":
             raise ConfigError(
                 "there is no fit of these choices yet",

@@ -13,7 +13,7 @@ from support.command_line import caller
 from support.meshes import write_ball
 
 import lidardesign as ld
-from lidardesign.api.learn import LearnOptions, LearnRequest
+from lidardesign.api.learn import LearnRequest
 from lidardesign.config import with_task_settings
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.run.manifest import read_manifest
@@ -152,7 +152,7 @@ def test_every_command_keeps_them_and_learning_again_takes_newcomers_in(place, c
     opened = RunFolder.open(run)
     judged = with_task_settings(opened.task, opened.config, ["truth_points=200"])
     assert judged.task.inputs == opened.config.task.inputs
-    again = LearnRequest.resolve("meshes", LearnOptions(out=tmp_path / "again", config=run / "config.yaml"))
+    again = LearnRequest.resolve("meshes", {"out": tmp_path / "again", "config": run / "config.yaml"})
     assert len(again.settings.task.inputs) == len(judged.task.inputs) + 3
 
 
@@ -161,7 +161,7 @@ def test_a_run_that_is_resumed_keeps_them_too(place, tmp_path):
     shutil.copytree(place / "run", run)
     come(place / "meshes")
     notes = []
-    request = LearnRequest.resolve("meshes", LearnOptions(out=run, resume=True), notes.append)
+    request = LearnRequest.resolve("meshes", {"out": run, "resume": True}, notes.append)
     assert request.settings.task.inputs == read_manifest(run)["inputs"]
     assert any("z.stl: added after" in note for note in notes)
 

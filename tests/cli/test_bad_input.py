@@ -26,12 +26,12 @@ from support.meshes import write_ball
 from support.mistakes import GARBAGE, GOOD, check_one_clear_message
 
 from lidardesign.errors import InfeasibleError
+from lidardesign.limits import MOST_RAYS
 from lidardesign.rays.pool import FILE_NAME as CACHE
 from lidardesign.run.files import run_lock
 from lidardesign.run.manifest import record
 from lidardesign.samples import load_samples, save_samples
 from lidardesign.scenes.scene import Ambient, Body, Medium, Receiver, Scene, Sphere
-from lidardesign.sensors.sensor import MOST_RAYS
 from lidardesign.space import FARTHEST_M
 
 LONG = 300 * "x"
@@ -345,7 +345,7 @@ CASES = [
     ("constrain run --constraints contradiction.yaml", 4, "", "gate."),
     ("constrain run --constraints parts.yaml", 2, "", "vl53l5cx"),
     *(
-        (f"constrain run --constraints {name}.yaml{further} --layout spiral", 2, "--layout", f"{name}.yaml holds no")
+        (f"constrain run --constraints {name}.yaml{further} --name ../x", 2, "--name", f"{name}.yaml holds no")
         for name in ("empty", "comment", "no_key")
         for further in ("", " --set gate.width_m.max=0.5")
     ),
@@ -669,7 +669,7 @@ def test_a_mistake_gets_one_message_its_exit_code_and_writes_nothing(
 
 
 PARTS, MODULES = "--parts vl53l8cx --sensors 2", "--modules 2 --fov 45x45 --zones 8x8"
-PLACING = "rays parts arrange at-origin azimuth-deg elevation-deg roll-deg"
+PLACING = "rays parts at-origin azimuth-deg elevation-deg roll-deg"
 # Options of `fit` and `constrain` that exclude each other, or of which one is nothing without the other, and how the
 # message names them: without dashes what may stand in a file of constraints as well.
 OF_FITS = [
@@ -718,6 +718,7 @@ EXCLUDING = [
     ("simulate good.yaml --out seen --scene ball.stl --set test=3", "--set", "--scene"),
     ("simulate good.yaml --out seen --scene ball.stl --scenes 2", "--scenes", "--scene:"),
     *((f"catalog show vl53l8cx --{option} 2", f"--{option}", "--out") for option in PLACING.split()),
+    ("catalog show vl53l8cx --arrange beside", "--arrange", "--out"),
     ("catalog show vl53l8cx --arrange beside --parts 1 --out part.yaml", "--arrange", "--parts"),
     *((f"config schema {kind} --task face", "--task", "config") for kind in ("constraints", "design", "evaluate")),
     ("show run --at x_m=1", "--at", "run"),

@@ -12,18 +12,18 @@ from lidardesign_tasks.robot.arm_robot import load_robot
 from support.command_line import make_run
 
 from lidardesign.cli.terminal.output import Output, describe_error
-from lidardesign.constraints.document import MOST_FITTED, Constraints
+from lidardesign.constraints.document import Constraints
 from lidardesign.density.fields.grids import _digest, _load
 from lidardesign.density.training.learned import seconds_at
 from lidardesign.density.training.trainer import _step_of
 from lidardesign.errors import ConfigError, DataError, PluginError
+from lidardesign.limits import MOST_FITTED, MOST_RAYS
 from lidardesign.mixture.fit import FitProblem, fit_sensors
 from lidardesign.registry import plugin_guard
 from lidardesign.run.manifest import record
 from lidardesign.samples import Samples, load_samples
 from lidardesign.scenes.mesh_files import check_mesh
 from lidardesign.sensors.bandwidth import split_budget
-from lidardesign.sensors.sensor import MOST_RAYS
 from lidardesign.simulate.light_transport import transport as light_transport_process
 from lidardesign.space import FARTHEST_M, DesignSpace
 

@@ -13,8 +13,8 @@ from support.constraints import FACE
 from lidardesign.constraints.document import Constraints, Gate, load_constraints, rules_of, split_settings
 from lidardesign.constraints.feasibility import check_feasible, unit_notes
 from lidardesign.errors import ConfigError, InfeasibleError
+from lidardesign.limits import MOST_RAYS
 from lidardesign.sensors.bandwidth import Bandwidth
-from lidardesign.sensors.sensor import MOST_RAYS
 from lidardesign.space import DesignSpace
 
 

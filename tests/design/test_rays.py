@@ -11,10 +11,11 @@ from support.designs import SPACE, sensor
 
 from lidardesign.constraints.document import Constraints
 from lidardesign.errors import ConfigError
+from lidardesign.limits import MOST_RAYS
 from lidardesign.rays.proposals import owners
 from lidardesign.sensors.bandwidth import split_budget
 from lidardesign.sensors.pattern import even_subset, grid_rows, grid_tangent
-from lidardesign.sensors.sensor import DEFAULT_LEVEL, MOST_RAYS, interval_factor
+from lidardesign.sensors.sensor import DEFAULT_LEVEL, interval_factor
 from lidardesign.space import direction
 
 Z = interval_factor(DEFAULT_LEVEL)

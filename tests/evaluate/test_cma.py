@@ -14,7 +14,7 @@ from support.baselines import balls
 from support.scoring import HitTask, MissTask, make_request
 from support.sensors import normal_sensor
 
-from lidardesign.api.scores import ScoreOptions
+from lidardesign.api.scores import score_choices
 from lidardesign.cli.commands.evaluate import search_display
 from lidardesign.errors import ConfigError
 from lidardesign.numerics import wrap_angle
@@ -284,7 +284,7 @@ def test_without_a_design_there_is_nothing_to_vary():
 @pytest.mark.parametrize(("seconds", "names"), [(0.0, ["cma"]), (math.nan, ["cma"]), (5.0, ["occupancy"])])
 def test_a_time_that_is_none_or_that_nothing_takes_is_refused(seconds, names):
     with pytest.raises(ConfigError, match="--cma-seconds"):
-        ScoreOptions(cma_seconds=seconds, baselines=names)
+        score_choices({"cma_seconds": seconds, "baselines": names})
 
 
 def test_each_search_has_a_line_that_shows_how_far_it_is_and_its_best_score():

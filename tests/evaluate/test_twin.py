@@ -15,7 +15,6 @@ from lidardesign.density.objective.proposals import samples_without_visibility
 from lidardesign.errors import DataError, InfeasibleError
 from lidardesign.fitting import fit as fit_module
 from lidardesign.fitting.fit import fit_design, twin_samples, twin_without_visibility
-from lidardesign.fitting.options import FitOptions
 from lidardesign.fitting.request import FitRequest, RunTarget
 from lidardesign.run_folder import RunFolder
 from lidardesign.scoring.baselines.greedy import Fired
@@ -61,7 +60,7 @@ def few_scenes(folder):
 def fit(run, case, visibility):
     """The design of a case, fitted to the exact density of its run without learning it."""
     config = run.config
-    request = FitRequest.resolve(run, FitOptions(constraints=LIMITS, rays=RAYS, seed=5, name="own", **CASES[case]))
+    request = FitRequest.resolve(run, {"constraints": LIMITS, "rays": RAYS, "seed": 5, "name": "own", **CASES[case]})
     generator = random_generator(config.seed, "no visibility")
     scenes, target = run.scenes("train", config.seed), RunTarget(run, visibility)
     samples = samples_without_visibility(scenes, config.space, config.density, SAMPLES, generator)

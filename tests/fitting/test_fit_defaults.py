@@ -14,10 +14,10 @@ from support.command_line import make_run
 from support.sensors import normal_sensor
 
 from lidardesign.api.run import open_run
+from lidardesign.choices.fit import BEST
 from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.fitting import request as requests
 from lidardesign.fitting import trials as tried
-from lidardesign.fitting.options import BEST, FitOptions
 from lidardesign.fitting.request import CHOSEN_LEVEL, FitRequest
 from lidardesign.run_folder import RunFolder
 from lidardesign.scenes.scene import group_numbers
@@ -28,7 +28,7 @@ MOUNTS = {"origin": {"mounts_m": [[0.2, 0, 0], [0.8, 0, 0]]}}
 
 
 def resolved(run, base=None, **options):
-    return FitRequest.resolve(RunFolder.open(run), FitOptions(**options), base)
+    return FitRequest.resolve(RunFolder.open(run), options, base)
 
 
 class TestWhatIsLeftOpen:

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from support.sensors import normal_sensor
 
 from lidardesign.errors import InfeasibleError
-from lidardesign.fitting.options import FitOptions
 from lidardesign.fitting.request import FitRequest
 from lidardesign.fitting.trials import FINENESS, GoalSearch, rounded_up
 from lidardesign.run_folder import RunFolder
@@ -58,7 +57,7 @@ class KnownScenes:
 
 def search(run, goal, least, better="lower", spread=0.0, **options):
     """A search for a goal among made-up designs."""
-    request = FitRequest.resolve(RunFolder.open(run), FitOptions(goal=abs(goal), least=least, **options))
+    request = FitRequest.resolve(RunFolder.open(run), {"goal": abs(goal), "least": least, **options})
     found = GoalSearch(replace(request, goal=goal), made_up, KnownScenes(spread, better))
     found.metric = Metric("error", "mm", better, 500.0 if better == "lower" else -500.0, 0.0)
     return found

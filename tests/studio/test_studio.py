@@ -23,7 +23,7 @@ from websockets.sync.client import connect
 from lidardesign.api.design import Design
 from lidardesign.api.run import open_run
 from lidardesign.errors import ConfigError, LidardesignError
-from lidardesign.studio import server
+from lidardesign.studio import open_page, server
 from lidardesign.studio.choices import Choices, SensorPose, constraint_keys, key_label
 from lidardesign.studio.studio import Studio
 
@@ -299,9 +299,9 @@ def test_a_server_that_lets_strangers_in_is_not_started(monkeypatch):
 
 def test_a_port_that_is_taken_is_refused(studio, robot):
     with pytest.raises(ConfigError, match="is taken"):
-        robot.studio(port=studio._guard.port)
+        open_page(robot, port=studio._guard.port)
     with pytest.raises(LidardesignError, match="port"):
-        robot.studio(port=0)
+        open_page(robot, port=0)
 
 
 def test_nothing_is_left_of_a_page_that_is_stopped(robot):

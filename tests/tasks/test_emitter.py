@@ -18,7 +18,6 @@ from lidardesign.constraints.document import Constraints
 from lidardesign.density.objective.proposals import propose
 from lidardesign.density.objective.target import build_target
 from lidardesign.fitting.fit import fit_design
-from lidardesign.fitting.options import FitOptions
 from lidardesign.fitting.request import FitRequest
 from lidardesign.run.manifest import start_manifest
 from lidardesign.run.yaml import parse_yaml
@@ -268,7 +267,7 @@ def test_floods_beside_the_detector_are_nearly_as_good_as_a_laser_at_it(heads, t
     start_manifest(run.folder, command=["lidardesign", "learn"], seed=config.seed)
     held_out, chamfer_mm = task.scenes(few.model_copy(update={"test": 8}), "test", 0), {}
     for name, constraints in DESIGNS.items():
-        request = FitRequest.resolve(run, FitOptions(constraints=constraints, rays=RAYS))
+        request = FitRequest.resolve(run, {"constraints": constraints, "rays": RAYS})
         rays = fit_design(request, samples=samples, target=target.log_density).design.rays(RAYS)
         scores = [task.score(scene, simulate(scene, rays, physics=SHADOWED)) for scene in held_out]
         chamfer_mm[name] = np.mean([score.value for score in scores])

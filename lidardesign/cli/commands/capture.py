@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lidardesign.cli.terminal import options
+from lidardesign.choices.files import CaptureCommand
+from lidardesign.choices.flag import complete
+from lidardesign.choices.shared import Printed
 from lidardesign.cli.terminal.grids import RichConsole, number, print_table
-from lidardesign.cli.terminal.options import words
-from lidardesign.cli.terminal.output import Output, claim_outputs, command, keep_times
-from lidardesign.errors import ConfigError, DataError, check_choice
+from lidardesign.cli.terminal.options import command_line
+from lidardesign.cli.terminal.output import Output, claim_outputs, keep_times
+from lidardesign.errors import ConfigError, DataError
 from lidardesign.run.clock import phase
 from lidardesign.run.outputs import check_outputs
 
@@ -34,105 +36,64 @@ COLUMNS = {
 }
 
 
+@command_line(CaptureCommand, Printed)
 def capture(
+    output: Output,
     file: Annotated[Path, typer.Argument(metavar="CAPTURE", readable=False, help="Captured histograms, .npz or .mat.")],
     designs: Annotated[
         list[Path],
         typer.Argument(metavar="DESIGN", readable=False, help="Design files, or what `export --format galvo` wrote."),
     ],
-    rays: options.RayCount = None,
-    at: options.At = None,
-    estimator: Annotated[
-        str,
-        typer.Option(
-            "--estimator",
-            metavar="peak|matched",
-            help="Range from the highest bin, or from the log-matched filter.",
-            autocompletion=words("peak|matched"),
-        ),
-    ] = "peak",
-    false_alarm: Annotated[
-        float,
-        typer.Option("--false-alarm", metavar="P", help="Probability that background alone is taken for a return."),
-    ] = 0.01,
-    within_deg: Annotated[
-        float | None,
-        typer.Option(
-            "--within-deg",
-            metavar="DEG",
-            help="Largest angle between a ray and the pixel that stands for it.",
-            show_default="the spacing of the pixels",
-        ),
-    ] = None,
-    outlier_mm: Annotated[
-        float,
-        typer.Option("--outlier-mm", metavar="MM", help="Returns that are off by more are outliers."),
-    ] = 10.0,
-    reference: Annotated[
-        Path | None,
-        typer.Option(
-            "--reference",
-            metavar="MESH",
-            help="The true surface, in metres in the design's frame.",
-            show_default="through the capture's true ranges",
-        ),
-    ] = None,
-    csv: Annotated[
-        Path | None,
-        typer.Option("--csv", metavar="FILE", help="Write every ray's range and point as CSV.", show_default=False),
-    ] = None,
-    json: options.Json = False,
-    quiet: options.Quiet = False,
-    verbose: options.Verbose = False,
+    **given: Any,
 ) -> None:
     """Score designs by a captured scan."""
-    with command(json=json, quiet=quiet, verbose=verbose) as output:
-        claim_outputs(output, csv=csv)
-        check_outputs({"--csv": csv}, [file, *designs, *([] if reference is None else [reference])])
-        if not 0 < false_alarm < 1:
-            raise ConfigError(f"{false_alarm}", where="--false-alarm", allowed="above 0 and below 1")
-        if within_deg is not None and not (0 < within_deg <= 180):
-            raise ConfigError(f"{within_deg}", where="--within-deg", allowed="above 0, at most 180 degrees")
-        if not (math.isfinite(outlier_mm) and outlier_mm > 0):
-            raise ConfigError(f"{outlier_mm}", where="--outlier-mm", allowed="a finite number above 0")
-        check_choice(estimator, "--estimator", ("peak", "matched"))
-        with phase("libraries"):
-            from lidardesign.scoring.captures.capture import load_capture
-            from lidardesign.scoring.captures.scan import Estimation, default_within_rad
-            from lidardesign.scoring.captures.score import CaptureSettings, evaluate_capture, write_csv
+    choices = complete(CaptureCommand, given)
+    csv, reference, within_deg = choices["csv"], choices["reference"], choices["within_deg"]
+    false_alarm, outlier_mm = choices["false_alarm"], choices["outlier_mm"]
+    claim_outputs(output, csv=csv)
+    check_outputs({"--csv": csv}, [file, *designs, *([] if reference is None else [reference])])
+    if not 0 < false_alarm < 1:
+        raise ConfigError(f"{false_alarm}", where="--false-alarm", allowed="above 0 and below 1")
+    if within_deg is not None and not (0 < within_deg <= 180):
+        raise ConfigError(f"{within_deg}", where="--within-deg", allowed="above 0, at most 180 degrees")
+    if not (math.isfinite(outlier_mm) and outlier_mm > 0):
+        raise ConfigError(f"{outlier_mm}", where="--outlier-mm", allowed="a finite number above 0")
+    with phase("libraries"):
+        from lidardesign.scoring.captures.capture import load_capture
+        from lidardesign.scoring.captures.scan import Estimation, default_within_rad
+        from lidardesign.scoring.captures.score import CaptureSettings, evaluate_capture, write_csv
+        from lidardesign.space import condition_values
 
-        place = options.parse_at(at)
-        scanned = [_rays_and_run(path, rays, place, output) for path in designs]
-        named = list(zip(_distinct_names(designs), (fired for fired, _ in scanned), strict=True))
-        with phase("capture"):
-            captured = load_capture(file)
-        within_rad = default_within_rad(captured) if within_deg is None else math.radians(within_deg)
-        settings = CaptureSettings(
-            Estimation(estimator, false_alarm),  # type: ignore[arg-type]
-            within_rad,
-            outlier_mm / 1000.0,
-            reference,
-        )
-        with phase("scoring"):
-            evaluation = evaluate_capture(captured, named, settings)
-        for note in evaluation.notes:
-            output.remark(note)
-        written: dict[str, Path] = {}
+    place = condition_values(choices["at"])
+    scanned = [_rays_and_run(path, choices["rays"], place, output) for path in designs]
+    named = list(zip(_distinct_names(designs), (fired for fired, _ in scanned), strict=True))
+    with phase("capture"):
+        captured = load_capture(file)
+    within_rad = default_within_rad(captured) if within_deg is None else math.radians(within_deg)
+    settings = CaptureSettings(
+        Estimation(choices["estimator"], false_alarm),  # type: ignore[arg-type]
+        within_rad,
+        outlier_mm / 1000.0,
+        reference,
+    )
+    with phase("scoring"):
+        evaluation = evaluate_capture(captured, named, settings)
+    for note in evaluation.notes:
+        output.remark(note)
+    written: dict[str, Path] = {}
 
-        def show_result() -> None:
-            document = {"capture": str(file), **evaluation.as_dict(), "files": [str(path) for path in written.values()]}
-            output.result(
-                document, lambda rich: _show(document, evaluation, rich, verbose=output.verbose), files=written
-            )
+    def show_result() -> None:
+        document = {"capture": str(file), **evaluation.as_dict(), "files": [str(path) for path in written.values()]}
+        output.result(document, lambda rich: _show(document, evaluation, rich, verbose=output.verbose), files=written)
 
-        with ExitStack() as rest:  # the scores are shown whatever becomes of the file
-            rest.callback(show_result)
-            for folder in dict.fromkeys(folder for _, folder in scanned if folder is not None):
-                rest.callback(keep_times, folder, "capture", output)
-            if csv is not None:
-                with phase("writing"):
-                    write_csv(evaluation, csv)
-                written["csv"] = csv
+    with ExitStack() as rest:  # the scores are shown whatever becomes of the file
+        rest.callback(show_result)
+        for folder in dict.fromkeys(folder for _, folder in scanned if folder is not None):
+            rest.callback(keep_times, folder, "capture", output)
+        if csv is not None:
+            with phase("writing"):
+                write_csv(evaluation, csv)
+            written["csv"] = csv
 
 
 def _rays_and_run(path: Path, count: int | None, at: dict[str, float], output: Output) -> tuple[Rays, Path | None]:

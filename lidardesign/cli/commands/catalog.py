@@ -13,50 +13,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lidardesign.cli.terminal import options
+from lidardesign.choices.flag import flags_of
+from lidardesign.choices.listings import ARRANGEMENTS, NewDesign, PartChoices, PartPlace
+from lidardesign.choices.shared import Brief
 from lidardesign.cli.terminal.grids import RichConsole, number, text_table
-from lidardesign.cli.terminal.output import Output, command
+from lidardesign.cli.terminal.options import command_line, parts
+from lidardesign.cli.terminal.output import Output
 from lidardesign.errors import ConfigError, check_choice
 from lidardesign.run.clock import phase
 
 if TYPE_CHECKING:
     from lidardesign.parts.part import Part
     from lidardesign.sensors.design import DesignSpec
-
-# How several parts at one place are turned against each other.
-ARRANGEMENTS = ("interleaved", "beside")
-Own = Annotated[
-    list[Path] | None,
-    typer.Option(
-        "--catalog",
-        metavar="PATH",
-        help="A part file of your own, or a folder of them; repeatable.",
-        show_default=False,
-    ),
-]
-Reflectance = Annotated[
-    float | None,
-    typer.Option(
-        "--reflectance",
-        metavar="PERCENT",
-        min=0.01,
-        max=100,
-        help="Ranges that sources state for targets of this reflectance.",
-        show_default=False,
-    ),
-]
-Klux = Annotated[
-    float | None,
-    typer.Option(
-        "--klux",
-        metavar="KLUX",
-        min=0,
-        max=1000,
-        help="Ranges that sources state for this ambient light.",
-        show_default=False,
-    ),
-]
-
 
 catalog_app = typer.Typer(help="List real parts, or show one and write a design of it.", invoke_without_command=True)
 
@@ -69,129 +37,79 @@ def catalog(context: typer.Context) -> None:
 
 
 @catalog_app.command("list")
+@command_line(PartChoices, Brief)
 def list_(
-    own: Own = None,
-    reflectance: Reflectance = None,
-    klux: Klux = None,
-    json: options.Json = False,
-    quiet: options.Quiet = False,
+    output: Output, *, own: Sequence[Path] = (), reflectance: float | None = None, klux: float | None = None
 ) -> None:
     """List all parts in all their modes. It shows pattern, field of view, range and the cost of reading them out."""
-    with command(json=json, quiet=quiet) as output:
-        with phase("libraries"):
-            from lidardesign.parts.catalogue import load_library
+    with phase("libraries"):
+        from lidardesign.parts.catalogue import load_library
 
-        parts, vouched = load_library(own or ()).every_mode(), []
-        for part in parts:
-            with contextlib.suppress(ConfigError):  # no source states a range under such conditions
-                vouched.append(part.under(reflectance_percent=reflectance, illuminance_klux=klux))
-        left_out = len(parts) - len(vouched)
-        output.result(
-            {"parts": [part_entry(part) for part in vouched], "left_out": left_out},
-            lambda rich: show_parts(vouched, rich),
-            show_costs=False,
-        )
-        if left_out:
-            output.note(f"note: {left_out} of {len(parts)} parts and modes have no range stated for such conditions")
+    every, vouched = load_library(own).every_mode(), []
+    for part in every:
+        with contextlib.suppress(ConfigError):  # no source states a range under such conditions
+            vouched.append(part.under(reflectance_percent=reflectance, illuminance_klux=klux))
+    left_out = len(every) - len(vouched)
+    output.result(
+        {"parts": [part_entry(part) for part in vouched], "left_out": left_out},
+        lambda rich: show_parts(vouched, rich),
+        show_costs=False,
+    )
+    if left_out:
+        output.note(f"note: {left_out} of {len(every)} parts and modes have no range stated for such conditions")
 
 
 @catalog_app.command("show")
+@command_line(PartChoices, NewDesign, PartPlace, Brief)
 def show(
+    output: Output,
     name: Annotated[
         str,
-        typer.Argument(metavar="NAME", help="A part's name, NAME:MODE, or a part file.", autocompletion=options.parts),
+        typer.Argument(metavar="NAME", help="A part's name, NAME:MODE, or a part file.", autocompletion=parts),
     ],
-    own: Own = None,
-    reflectance: Reflectance = None,
-    klux: Klux = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", metavar="FILE.yaml", help="Write a design of the part.", show_default=False)
-    ] = None,
-    at_origin: Annotated[
-        str | None,
-        typer.Option("--at-origin", metavar="X,Y,Z", help="Where it stands, in metres.", show_default="0,0,0"),
-    ] = None,
-    azimuth: Annotated[
-        float | None,
-        typer.Option(
-            "--azimuth-deg", metavar="DEG", min=-360, max=360, help="Azimuth of its forward axis.", show_default="0"
-        ),
-    ] = None,
-    elevation: Annotated[
-        float | None,
-        typer.Option(
-            "--elevation-deg", metavar="DEG", min=-90, max=90, help="Elevation of its forward axis.", show_default="0"
-        ),
-    ] = None,
-    roll: Annotated[
-        float | None,
-        typer.Option(
-            "--roll-deg", metavar="DEG", min=-360, max=360, help="Roll about its forward axis.", show_default="0"
-        ),
-    ] = None,
-    rays: Annotated[
-        int | None,
-        typer.Option(
-            "--rays", metavar="N", min=1, max=1_000_000, help="Rays per frame.", show_default="all that it has"
-        ),
-    ] = None,
-    parts: Annotated[
-        int | None,
-        typer.Option("--parts", metavar="N", min=1, max=1000, help="Parts.", show_default="as many as the rays need"),
-    ] = None,
-    arrange: Annotated[
-        str | None,
-        typer.Option(
-            "--arrange",
-            metavar="interleaved|beside",
-            help="Several parts share a field of view and interleave their rays, or have theirs side by side.",
-            show_default="interleaved",
-            autocompletion=options.words("interleaved|beside"),
-        ),
-    ] = None,
-    json: options.Json = False,
-    quiet: options.Quiet = False,
+    *,
+    own: Sequence[Path] = (),
+    reflectance: float | None = None,
+    klux: float | None = None,
+    out: Path | None = None,
+    **place: Any,
 ) -> None:
     """Show a part, or write a design of it. Every figure has its conditions and its source."""
-    with command(json=json, quiet=quiet) as output:
-        with phase("libraries"):
-            from lidardesign.parts.catalogue import find_part
-            from lidardesign.sensors.design_file import MOST_FILE_RAYS, save_design
+    with phase("libraries"):
+        from lidardesign.parts.catalogue import find_part
+        from lidardesign.sensors.design_file import MOST_FILE_RAYS, save_design
 
-        part = find_part(name, own or ()).under(reflectance_percent=reflectance, illuminance_klux=klux)
-        document = part_document(part)
-        given = {
-            "--at-origin": at_origin, "--azimuth-deg": azimuth, "--elevation-deg": elevation, "--roll-deg": roll,
-            "--rays": rays, "--parts": parts, "--arrange": arrange,
-        }  # fmt: skip
-        if out is not None:
-            design = _placed(part, given, out.stem, output)
-            document |= {"design": str(out), "design_rays": design.count, "sensors": len(design.sensors)}
-            if (design.count or 0) > MOST_FILE_RAYS:
-                raise ConfigError(
-                    f"{design.count} rays are too many for a design file",
-                    where=str(out),
-                    allowed=f"at most {MOST_FILE_RAYS:,}",
-                    hint="--rays N takes an evenly spread subset",
-                )
-            with phase("writing"):
-                save_design(design, out)
-        elif useless := [option for option, value in given.items() if value is not None]:
-            raise ConfigError("says how a design is made", where=useless[0], hint="--out FILE.yaml writes one")
-        output.result(
-            document,
-            lambda rich: show_part(part, document, rich),
-            files=None if out is None else {f"{part.name}, {document['design_rays']} rays": out},
-            show_costs=False,
-        )
+    part = find_part(name, own).under(reflectance_percent=reflectance, illuminance_klux=klux)
+    document = part_document(part)
+    given = {flag.option: place.get(key) for key, flag in flags_of(PartPlace).items()}
+    if out is not None:
+        design = _placed(part, given, out.stem, output)
+        document |= {"design": str(out), "design_rays": design.count, "sensors": len(design.sensors)}
+        if (design.count or 0) > MOST_FILE_RAYS:
+            raise ConfigError(
+                f"{design.count} rays are too many for a design file",
+                where=str(out),
+                allowed=f"at most {MOST_FILE_RAYS:,}",
+                hint="--rays N takes an evenly spread subset",
+            )
+        with phase("writing"):
+            save_design(design, out)
+    elif useless := [option for option, value in given.items() if value is not None]:
+        raise ConfigError("says how a design is made", where=useless[0], hint="--out FILE.yaml writes one")
+    output.result(
+        document,
+        lambda rich: show_part(part, document, rich),
+        files=None if out is None else {f"{part.name}, {document['design_rays']} rays": out},
+        show_costs=False,
+    )
 
 
 def _placed(part: Part, given: dict[str, Any], name: str, output: Output) -> DesignSpec:
     import numpy as np
 
+    from lidardesign.limits import MOST_RAYS
     from lidardesign.parts.catalogue import Pose, interleaved, part_design, parts_for, side_by_side
     from lidardesign.run.yaml import plain_number
-    from lidardesign.sensors.sensor import MOST_RAYS
     from lidardesign.space import FARTHEST_M
 
     count, number = given["--rays"], given["--parts"]

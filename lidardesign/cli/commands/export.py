@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from lidardesign.cli.terminal import options
+from lidardesign.choices.files import ExportChoices, ExportCommand
+from lidardesign.choices.flag import complete
+from lidardesign.choices.shared import Printed
 from lidardesign.cli.terminal.grids import RichConsole, text_table
-from lidardesign.cli.terminal.options import formats
-from lidardesign.cli.terminal.output import Output, announce, command, keep_times, written_file
+from lidardesign.cli.terminal.options import command_line
+from lidardesign.cli.terminal.output import Output, announce, keep_times, written_file
 from lidardesign.errors import ConfigError
 from lidardesign.run.clock import phase
 from lidardesign.run.outputs import check_outputs
@@ -20,93 +22,62 @@ from lidardesign.run.outputs import check_outputs
 EXPLANATION = re.compile(r"[:;] .*", re.DOTALL)
 
 
+@command_line(ExportCommand, ExportChoices, Printed)
 def export(
+    output: Output,
     design: Annotated[
         Path | None,
         typer.Argument(
             metavar="DESIGN", readable=False, help="A design file, or the file of a rig.", show_default=False
         ),
     ] = None,
-    format_: Annotated[
-        str | None,
-        typer.Option(
-            "--format",
-            metavar="NAME",
-            help="Format; --list shows them.",
-            show_default=False,
-            autocompletion=formats,
-        ),
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", metavar="PATH", help="File to write.", show_default="beside the design"),
-    ] = None,
-    rays: options.RayCount = None,
-    at: options.At = None,
-    rate_hz: Annotated[
-        float | None,
-        typer.Option(
-            "--rate-hz",
-            metavar="HZ",
-            help="Frames per second, in formats that hold it.",
-            show_default="10, as in the read-out model",
-        ),
-    ] = None,
-    robot: Annotated[
-        Path | None,
-        typer.Option(
-            "--robot",
-            metavar="MODEL",
-            help="MuJoCo model to put the sensors on (mjcf).",
-            show_default="that of the run of a mounted design",
-        ),
-    ] = None,
-    list_formats: Annotated[bool, typer.Option("--list", help="List the formats.")] = False,
-    json: options.Json = False,
-    quiet: options.Quiet = False,
-    verbose: options.Verbose = False,
+    *,
+    format: str | None = None,
+    out: Path | None = None,
+    list_formats: bool = False,
+    **given: Any,
 ) -> None:
     """Write a design in another program's format."""
-    with command(json=json, quiet=quiet, verbose=verbose) as output:
-        with phase("libraries"):
-            from lidardesign.api.export import (
-                DesignSource,
-                ExportRequest,
-                export_target,
-                exporter_of,
-            )
-            from lidardesign.formats.designs import read_design
+    with phase("libraries"):
+        from lidardesign.api.export import (
+            DesignSource,
+            ExportRequest,
+            export_target,
+            exporter_of,
+        )
+        from lidardesign.formats.designs import read_design
 
-        if list_formats:
-            return _list(output)
-        place = options.parse_at(at)
-        if design is None:
-            raise ConfigError("no design was given", where="DESIGN", hint="lidardesign export --list shows the formats")
-        exporter = exporter_of(format_)
-        source = DesignSource(read_design(design, output.remark), path=design)
-        target = export_target(design, out, exporter)
-        request = ExportRequest(source, exporter, target, rays, place, rate_hz, robot=robot)
-        announce([target], output)
-        check_outputs({"--out": target}, [robot] if robot else [], ("--out",) if exporter.folder else ())
-        notes: list[str] = []
-        with written_file(target, exporter.suffix) as file:
-            exported = request.write(file, notes.append)
-        for note in notes:
-            if output.verbose or note not in exported.notes:
-                output.remark(note)
-        if exported.notes and not output.verbose:
-            heads = [EXPLANATION.sub("", note) for note in exported.notes]
-            output.remark("; ".join(heads) + (" (-v says more)" if heads != list(exported.notes) else ""))
-        if source.folder is not None:
-            keep_times(source.folder, "export", output)
+    if list_formats:
+        return _list(output)
+    if design is None:
+        raise ConfigError("no design was given", where="DESIGN", hint="lidardesign export --list shows the formats")
+    choices = complete(ExportChoices, given)
+    exporter = exporter_of(format)
+    source = DesignSource(read_design(design, output.remark), path=design)
+    target = export_target(design, out, exporter)
+    robot = choices["robot"]
+    request = ExportRequest(source, exporter, target, choices["rays"], choices["at"], choices["rate_hz"], robot)
+    announce([target], output)
+    check_outputs({"--out": target}, [robot] if robot else [], ("--out",) if exporter.folder else ())
+    notes: list[str] = []
+    with written_file(target, exporter.suffix) as file:
+        exported = request.write(file, notes.append)
+    for note in notes:
+        if output.verbose or note not in exported.notes:
+            output.remark(note)
+    if exported.notes and not output.verbose:
+        heads = [EXPLANATION.sub("", note) for note in exported.notes]
+        output.remark("; ".join(heads) + (" (-v says more)" if heads != list(exported.notes) else ""))
+    if source.folder is not None:
+        keep_times(source.folder, "export", output)
 
-        def show(rich: RichConsole) -> None:
-            count, noun = (exported.rays, "ray") if exported.rays else (exported.sensors, "sensor")
-            content = f"{count} {noun}{'s' * (count != 1)}"
-            rich.print(f"wrote {target} ({content})", soft_wrap=True)
+    def show(rich: RichConsole) -> None:
+        count, noun = (exported.rays, "ray") if exported.rays else (exported.sensors, "sensor")
+        content = f"{count} {noun}{'s' * (count != 1)}"
+        rich.print(f"wrote {target} ({content})", soft_wrap=True)
 
-        document = {"design": str(design), **exported.as_dict()}
-        output.result(document, show, files={"wrote": target} if output.quiet else None, says_time=True)
+    document = {"design": str(design), **exported.as_dict()}
+    output.result(document, show, files={"wrote": target} if output.quiet else None, says_time=True)
 
 
 def _list(output: Output) -> None:

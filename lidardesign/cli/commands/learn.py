@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lidardesign.cli.terminal import options
+from lidardesign.choices.learn import LearnCommand
+from lidardesign.choices.shared import Printed
 from lidardesign.cli.terminal.grids import RichConsole, duration, text_table
-from lidardesign.cli.terminal.options import tasks, words
-from lidardesign.cli.terminal.output import command, keep_times
+from lidardesign.cli.terminal.options import command_line, tasks
+from lidardesign.cli.terminal.output import Output, keep_times
 from lidardesign.run.clock import WAIT_S, phase
 
 if TYPE_CHECKING:
@@ -29,7 +31,9 @@ FIGURES = (
 )
 
 
+@command_line(LearnCommand, Printed)
 def learn(
+    output: Output,
     task: Annotated[
         str | None,
         typer.Argument(
@@ -39,105 +43,43 @@ def learn(
             show_default="that of --config, or of the run that is resumed",
         ),
     ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", metavar="RUN", help="Run folder to make.", show_default="runs/TASK"),
-    ] = None,
-    preset: options.Preset = None,
-    config: options.ConfigFile = None,
-    overrides: options.Overrides = None,
-    seed: options.Seed = None,
-    device: Annotated[
-        str,
-        typer.Option(
-            "--device",
-            metavar="auto|cpu|cuda",
-            help="Where to train the flow; auto uses a GPU if there is one.",
-            autocompletion=words("auto|cpu|cuda"),
-        ),
-    ] = "auto",
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Continue an interrupted run from its last checkpoint.")
-    ] = False,
-    overwrite: Annotated[
-        bool,
-        typer.Option(
-            "--overwrite", help="Replace the run in the folder, and its designs, once the new one is learned."
-        ),
-    ] = False,
-    tolerance: Annotated[
-        float | None,
-        typer.Option(
-            "--tolerance",
-            metavar="SHARE",
-            help="Set learning.misplaced: learn until at most this share of the density's mass is in the wrong place; "
-            "exit 1 if the steps run out first.",
-            show_default=False,
-        ),
-    ] = None,
-    time_budget: Annotated[
-        float | None,
-        typer.Option(
-            "--time-budget",
-            metavar="SECONDS",
-            help="Learn for this long, however good the density is; measuring it takes extra time.",
-            show_default=False,
-        ),
-    ] = None,
-    dry_run: Annotated[
-        bool,
-        typer.Option("--dry-run", help="Check everything, say what would be written and how long it takes, and stop."),
-    ] = False,
-    json: options.Json = False,
-    quiet: options.Quiet = False,
-    verbose: options.Verbose = False,
+    *,
+    dry_run: bool = False,
+    **choices: Any,
 ) -> None:
     """Learn where rays are worth firing for TASK, into a run folder."""
-    with command(json=json, quiet=quiet, verbose=verbose) as output:
-        with phase("libraries"):
-            from lidardesign.api.learn import LearnOptions, LearnRequest, check_tolerance, result_document
+    with phase("libraries"):
+        from lidardesign.api.learn import LearnRequest, check_tolerance, result_document
 
-        chosen = LearnOptions(
-            out=out,
-            preset=preset,
-            settings=overrides or (),
-            config=config,
-            seed=seed,
-            device=device,
-            resume=resume,
-            overwrite=overwrite,
-            tolerance=tolerance,
-            time_budget_s=time_budget,
-            command=("lidardesign", *sys.argv[1:]),
-        )
-        request = LearnRequest.resolve(task, chosen, output.remark)
-        said: list[str] = []
+    request = LearnRequest.resolve(task, choices, output.remark)
+    request = replace(request, command=("lidardesign", *sys.argv[1:]))
+    said: list[str] = []
 
-        def remark(note: str) -> None:
-            said.append(note)
+    def remark(note: str) -> None:
+        said.append(note)
+        output.remark(note)
+
+    for note in request.task_notes():
+        remark(note)
+    if dry_run:
+        with output.progress("timing a few steps"):
+            document = request.plan(remark)
+        return output.result(document, partial(_show_plan, document), show_costs=False)
+    output.when_interrupted = request.resume_hint
+    with output.progress("learning") as progress:
+        result = request.run(partial(_show_progress, progress), remark)
+    keep_times(request.folder, "learn", output, wait_s=WAIT_S)
+    for note in result.notes:
+        if note not in said:
             output.remark(note)
 
-        for note in request.task_notes():
-            remark(note)
-        if dry_run:
-            with output.progress("timing a few steps"):
-                document = request.plan(remark)
-            return output.result(document, partial(_show_plan, document), show_costs=False)
-        output.when_interrupted = request.resume_hint
-        with output.progress("learning") as progress:
-            result = request.run(partial(_show_progress, progress), remark)
-        keep_times(request.folder, "learn", output, wait_s=WAIT_S)
-        for note in result.notes:
-            if note not in said:
-                output.remark(note)
+    def show(rich: RichConsole) -> None:
+        if output.verbose:
+            _show_figures(result, rich)
+        _show(result, request.settings.preset, rich)
 
-        def show(rich: RichConsole) -> None:
-            if output.verbose:
-                _show_figures(result, rich)
-            _show(result, request.settings.preset, rich)
-
-        output.result(result_document(result), show, files={"run": Path(result.run)}, says_time=True)
-        check_tolerance(result, tolerance)
+    output.result(result_document(result), show, files={"run": Path(result.run)}, says_time=True)
+    check_tolerance(result, request.choices["tolerance"])
 
 
 def _show_plan(document: dict[str, Any], rich: RichConsole) -> None:

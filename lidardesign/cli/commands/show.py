@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lidardesign.cli.terminal import options
+from lidardesign.choices.files import ShowCommand
+from lidardesign.choices.shared import Brief
 from lidardesign.cli.terminal.design_tables import show_constraints, show_design
 from lidardesign.cli.terminal.grids import RichConsole, difference_cell, duration, number, print_table, value_cells
-from lidardesign.cli.terminal.output import Output, command
+from lidardesign.cli.terminal.options import command_line
+from lidardesign.cli.terminal.output import Output
 from lidardesign.errors import ConfigError, LidardesignError
 from lidardesign.run.clock import phase
 
@@ -29,7 +31,9 @@ SENSOR_COLUMNS = (
 )  # fmt: skip
 
 
+@command_line(ShowCommand, Brief)
 def show(
+    output: Output,
     design: Annotated[
         Path,
         typer.Argument(metavar="RUN|DESIGN", readable=False, help="A run folder, a design file, or the file of a rig."),
@@ -40,81 +44,80 @@ def show(
             metavar="OTHER", readable=False, help="Another design: show only what differs.", show_default=False
         ),
     ] = None,
-    at: options.At = None,
-    space_of: options.SpaceOf = None,
-    json: options.Json = False,
-    quiet: options.Quiet = False,
+    *,
+    at: Sequence[str] = (),
+    space_of: Path | None = None,
 ) -> None:
     """Show a run and what to do next, a design, or how two differ."""
-    with command(json=json, quiet=quiet) as output:
-        if design.is_dir() and other is None:
-            return _show_run(design, {"--at": at, "--in": space_of}, output)
-        with phase("libraries"):
-            from lidardesign.constraints.check import check_design
-            from lidardesign.constraints.slack import broken_notes, room_of
-            from lidardesign.formats.designs import reach_beside, reach_of, read_design, run_of
-            from lidardesign.run_folder import RunFolder
-            from lidardesign.sensors.compare import outside_notes, readout_of
-            from lidardesign.sensors.design_file import design_document, pattern_document
+    if design.is_dir() and other is None:
+        return _show_run(design, {"--at": at, "--in": space_of}, output)
+    with phase("libraries"):
+        from lidardesign.constraints.check import check_design
+        from lidardesign.constraints.slack import broken_notes, room_of
+        from lidardesign.formats.designs import reach_beside, reach_of, read_design, run_of
+        from lidardesign.run_folder import RunFolder
+        from lidardesign.sensors.compare import outside_notes, readout_of
+        from lidardesign.sensors.design_file import design_document, pattern_document
+        from lidardesign.space import condition_values
 
-        condition = options.parse_at(at)
-        run = None if space_of is None else RunFolder.open(space_of)
-        given = [run] if run else []
-        files = [design] if other is None else [design, other]
-        reach_m = reach_of(given) if other is None else reach_beside(files, given)
-        read = [read_design(path, output.remark, reach_m) for path in files]
-        shown = [one.at_condition(condition) if condition else one for one in read]
-        if other is not None:
-            return _show_differences(files, shown, output)
-        specification = read[0]
-        try:
-            run = run or run_of(specification, design)
-        except LidardesignError as error:  # its run is not needed to show a design
-            if specification.constraints:
-                output.remark(f"the design space is not checked: {error}")
-        space = None if run is None else run.config.space
-        checks = check_design(
-            design_document(specification), specification.constraints, space if specification.constraints else None
-        )
-        outside = [] if space is None else outside_notes(specification, space)
-        for line in (*outside, *broken_notes(specification.name, checks)):
+    condition = condition_values(at)
+    run = None if space_of is None else RunFolder.open(space_of)
+    given = [run] if run else []
+    files = [design] if other is None else [design, other]
+    reach_m = reach_of(given) if other is None else reach_beside(files, given)
+    read = [read_design(path, output.remark, reach_m) for path in files]
+    shown = [one.at_condition(condition) if condition else one for one in read]
+    if other is not None:
+        return _show_differences(files, shown, output)
+    specification = read[0]
+    try:
+        run = run or run_of(specification, design)
+    except LidardesignError as error:  # its run is not needed to show a design
+        if specification.constraints:
+            output.remark(f"the design space is not checked: {error}")
+    space = None if run is None else run.config.space
+    checks = check_design(
+        design_document(specification), specification.constraints, space if specification.constraints else None
+    )
+    outside = [] if space is None else outside_notes(specification, space)
+    for line in (*outside, *broken_notes(specification.name, checks)):
+        output.remark(line)
+    specification = shown[0]
+    reaches = []
+    if any(sensor.part for sensor in specification.sensors):
+        from lidardesign.simulate.calibration import reach_notes, reaches_of
+
+        reaches = [vars(one) for one in reaches_of(specification)]
+        for line in reach_notes(specification):
             output.remark(line)
-        specification = shown[0]
-        reaches = []
-        if any(sensor.part for sensor in specification.sensors):
-            from lidardesign.simulate.calibration import reach_notes, reaches_of
+    readout = readout_of(specification)
+    document = {
+        "design": str(design),
+        "name": specification.name,
+        "layout": specification.layout,
+        "rays": specification.count,
+        "level": specification.level,
+        "at": dict(specification.at),
+        "frame": specification.mount or "world",
+        "sensors": [sensor.as_dict() for sensor in specification.sensors],
+        "reaches": reaches,
+        "patterns": [pattern_document(pattern) for pattern in specification.patterns],
+        "constraints": specification.constraints,
+        "checks": [
+            {**check.as_dict(), "room": left.room, "tight": left.is_tight}
+            for check, left in zip(checks, map(room_of, checks), strict=True)
+        ],
+        "bandwidth": readout.as_dict(),
+        "certificates": [*specification.certificates],
+        "provenance": specification.provenance,
+    }
 
-            reaches = [vars(one) for one in reaches_of(specification)]
-            for line in reach_notes(specification):
-                output.remark(line)
-        readout = readout_of(specification)
-        document = {
-            "design": str(design),
-            "name": specification.name,
-            "layout": specification.layout,
-            "rays": specification.count,
-            "level": specification.level,
-            "at": dict(specification.at),
-            "frame": specification.mount or "world",
-            "sensors": [sensor.as_dict() for sensor in specification.sensors],
-            "reaches": reaches,
-            "patterns": [pattern_document(pattern) for pattern in specification.patterns],
-            "constraints": specification.constraints,
-            "checks": [
-                {**check.as_dict(), "room": left.room, "tight": left.is_tight}
-                for check, left in zip(checks, map(room_of, checks), strict=True)
-            ],
-            "bandwidth": readout.as_dict(),
-            "certificates": [*specification.certificates],
-            "provenance": specification.provenance,
-        }
+    def show_all(rich: RichConsole) -> None:
+        show_design(specification, rich)
+        show_constraints(checks, rich)
+        _show_readout(readout, rich)
 
-        def show_all(rich: RichConsole) -> None:
-            show_design(specification, rich)
-            show_constraints(checks, rich)
-            _show_readout(readout, rich)
-
-        output.result(document, show_all, show_costs=False)
+    output.result(document, show_all, show_costs=False)
 
 
 def _show_run(folder: Path, given: Mapping[str, Any], output: Output) -> None:

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from lidardesign.cli.terminal import options
-from lidardesign.cli.terminal.output import command
+from lidardesign.choices.files import StudioChoices, StudioCommand
+from lidardesign.choices.shared import Spoken
+from lidardesign.cli.terminal.options import command_line
+from lidardesign.cli.terminal.output import Output
 from lidardesign.run.clock import phase
 
 
+@command_line(StudioChoices, StudioCommand, Spoken)
 def studio(
+    output: Output,
     run: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder that `learn` made.")],
     design: Annotated[
         Path | None,
@@ -20,12 +24,9 @@ def studio(
             metavar="DESIGN", readable=False, help="The design to begin with.", show_default="the last of RUN"
         ),
     ] = None,
-    port: Annotated[
-        int | None, typer.Option("--port", metavar="N", help="Port to listen on.", show_default="any that is free")
-    ] = None,
-    no_browser: Annotated[bool, typer.Option("--no-browser", help="Print the address alone.")] = False,
-    quiet: options.Quiet = False,
-    verbose: options.Verbose = False,
+    *,
+    no_browser: bool = False,
+    **choices: Any,
 ) -> None:
     """Move sensors on a page and see what they are worth.
 
@@ -33,20 +34,20 @@ def studio(
     chooses all the rest again, within the limits; a score on training scenes follows every change. Score judges on
     held-out scenes. Ctrl-C ends the page.
     """
-    with command(json=False, quiet=quiet, verbose=verbose) as output:
-        with phase("libraries"):
-            from lidardesign.api.run import load_design, open_run
+    with phase("libraries"):
+        from lidardesign.api.run import load_design, open_run
+        from lidardesign.studio import open_page
 
-        opened = open_run(run)
-        chosen = None if design is None else load_design(design, opened, output.remark)
-        if chosen is None and not opened.design_paths():
-            output.remark("the run has no design yet: one is fitted first")
-        with output.progress("opening"):
-            page = opened.studio(chosen, port=port)
-        with page:
-            print(page.address, flush=True)
-            if not no_browser:
-                import webbrowser
+    opened = open_run(run)
+    chosen = None if design is None else load_design(design, opened, output.remark)
+    if chosen is None and not opened.design_paths():
+        output.remark("the run has no design yet: one is fitted first")
+    with output.progress("opening"):
+        page = open_page(opened, chosen, **choices)
+    with page:
+        print(page.address, flush=True)
+        if not no_browser:
+            import webbrowser
 
-                webbrowser.open(page.address)
-            page.wait()
+            webbrowser.open(page.address)
+        page.wait()

@@ -8,9 +8,13 @@ from typing import Annotated, Any
 
 import typer
 
+from lidardesign.choices.flag import complete
+from lidardesign.choices.listings import CheckCommand, NewCommand
+from lidardesign.choices.shared import Brief
 from lidardesign.cli.terminal import options
 from lidardesign.cli.terminal.grids import RichConsole, text_table
-from lidardesign.cli.terminal.output import command
+from lidardesign.cli.terminal.options import command_line
+from lidardesign.cli.terminal.output import Output
 from lidardesign.errors import pasted
 from lidardesign.run.clock import phase
 
@@ -27,20 +31,19 @@ def tasks(context: typer.Context) -> None:
 
 
 @tasks_app.command("list")
+@command_line(Brief)
 def list_(
-    json: options.Json = False,
-    quiet: options.Quiet = False,
+    output: Output,
 ) -> None:
     """List the installed tasks; a broken one with its reason."""
-    with command(json=json, quiet=quiet) as output:
-        with phase("libraries"):
-            from lidardesign.registry import list_tasks
+    with phase("libraries"):
+        from lidardesign.registry import list_tasks
 
-        entries = [
-            {"name": item.name, "summary": item.summary, "distribution": item.distribution, "error": item.error}
-            for item in list_tasks()
-        ]
-        output.result({"tasks": entries}, lambda rich: _show_list(entries, rich), show_costs=False)
+    entries = [
+        {"name": item.name, "summary": item.summary, "distribution": item.distribution, "error": item.error}
+        for item in list_tasks()
+    ]
+    output.result({"tasks": entries}, lambda rich: _show_list(entries, rich), show_costs=False)
 
 
 def _show_list(entries: list[dict[str, Any]], rich: RichConsole) -> None:
@@ -58,19 +61,18 @@ def _show_list(entries: list[dict[str, Any]], rich: RichConsole) -> None:
 
 
 @tasks_app.command("show")
+@command_line(Brief)
 def show(
+    output: Output,
     name: Annotated[str, typer.Argument(metavar="NAME", help="Name of a task.", autocompletion=options.tasks)],
-    json: options.Json = False,
-    quiet: options.Quiet = False,
 ) -> None:
     """Show a task. It has a metric, a design space and keys of its configuration."""
-    with command(json=json, quiet=quiet) as output:
-        with phase("libraries"):
-            from lidardesign.api.config_reference import describe_task
-            from lidardesign.registry import load_task
+    with phase("libraries"):
+        from lidardesign.api.config_reference import describe_task
+        from lidardesign.registry import load_task
 
-        document = describe_task(load_task(name))
-        output.result(document, lambda rich: _show_task(document, rich), show_costs=False)
+    document = describe_task(load_task(name))
+    output.result(document, lambda rich: _show_task(document, rich), show_costs=False)
 
 
 def _show_task(document: Mapping[str, Any], rich: RichConsole) -> None:
@@ -114,40 +116,35 @@ def _yaml_value(value: Any) -> str:
 
 
 @tasks_app.command("check")
+@command_line(CheckCommand, Brief)
 def check(
+    output: Output,
     name: Annotated[
         str, typer.Argument(metavar="NAME", help="Name of an installed task.", autocompletion=options.tasks)
     ],
-    config: options.ConfigFile = None,
-    overrides: options.Overrides = None,
-    seconds: Annotated[
-        float,
-        typer.Option("--seconds", metavar="S", min=0.1, max=86_400, help="Longest time that one call may take."),
-    ] = 60.0,
-    seed: options.Seed = None,
-    json: options.Json = False,
-    quiet: options.Quiet = False,
+    **given: Any,
 ) -> None:
     """Check that a task keeps the contract. Every law is tried; exit 6 where one does not hold."""
-    with command(json=json, quiet=quiet) as output:
-        with phase("libraries"):
-            from lidardesign.contract.contract import LAWS, refuse_broken
-            from lidardesign.contract.process import CheckRequest, check_in_process
+    with phase("libraries"):
+        from lidardesign.contract.contract import LAWS, refuse_broken
+        from lidardesign.contract.process import CheckRequest, check_in_process
 
-        findings = []
-        with output.progress("contract") as progress, phase("contract"):
-            for finding in check_in_process(CheckRequest(name, config, tuple(overrides or ()), seed, seconds)):
-                findings.append(finding)
-                progress.show(len(findings), len(LAWS) + 1, detail=finding.law)
-        counts = {outcome: sum(finding.outcome == outcome for finding in findings) for outcome in OUTCOMES}
-        document = {
-            "task": name,
-            "keeps": not counts["fail"],
-            **counts,
-            "laws": [finding.as_dict() for finding in findings],
-        }
-        output.result(document, lambda rich: _show_laws(document, rich))
-        refuse_broken(name, findings)
+    choices = complete(CheckCommand, given)
+    request = CheckRequest(name, choices["config"], tuple(choices["settings"]), choices["seed"], choices["seconds"])
+    findings = []
+    with output.progress("contract") as progress, phase("contract"):
+        for finding in check_in_process(request):
+            findings.append(finding)
+            progress.show(len(findings), len(LAWS) + 1, detail=finding.law)
+    counts = {outcome: sum(finding.outcome == outcome for finding in findings) for outcome in OUTCOMES}
+    document = {
+        "task": name,
+        "keeps": not counts["fail"],
+        **counts,
+        "laws": [finding.as_dict() for finding in findings],
+    }
+    output.result(document, lambda rich: _show_laws(document, rich))
+    refuse_broken(name, findings)
 
 
 def _show_laws(document: Mapping[str, Any], rich: RichConsole) -> None:
@@ -168,27 +165,24 @@ def _show_laws(document: Mapping[str, Any], rich: RichConsole) -> None:
 
 
 @tasks_app.command("new")
+@command_line(NewCommand, Brief)
 def new(
+    output: Output,
     name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the task, as `learn` will take it.")],
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", metavar="DIR", help="Where to, a new folder.", show_default="lidardesign-NAME"),
-    ] = None,
-    json: options.Json = False,
-    quiet: options.Quiet = False,
+    *,
+    out: Path | None = None,
 ) -> None:
     """Write an installable package of a new task. It keeps the contract and passes its own tests as it is."""
-    with command(json=json, quiet=quiet) as output:
-        with phase("libraries"):
-            from lidardesign.contract.scaffold import new_task
+    with phase("libraries"):
+        from lidardesign.contract.scaffold import new_task
 
-        written = new_task(name, out)
-        folder = written[0].parent
+    written = new_task(name, out)
+    folder = written[0].parent
 
-        def show_files(rich: RichConsole) -> None:
-            for path in written:
-                rich.print(f"  {path}")
-            advice = f"next: pip install --editable {pasted(f'{folder}[test]')}, then lidardesign tasks check {name}"
-            rich.print(advice, soft_wrap=True)
+    def show_files(rich: RichConsole) -> None:
+        for path in written:
+            rich.print(f"  {path}")
+        advice = f"next: pip install --editable {pasted(f'{folder}[test]')}, then lidardesign tasks check {name}"
+        rich.print(advice, soft_wrap=True)
 
-        output.result({"task": name, "folder": folder, "files": written}, show_files, show_costs=False)
+    output.result({"task": name, "folder": folder, "files": written}, show_files, show_costs=False)

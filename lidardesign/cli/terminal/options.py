@@ -1,9 +1,12 @@
-"""Options that several subcommands share, and their values for shell completion (files are completed by the shell)."""
+"""Commands of the command line from the tables of `choices`, and values for shell completion.
+
+Files are completed by the shell.
+"""
 
 from __future__ import annotations
 
-import math
-import re
+import functools
+import inspect
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_origin
@@ -11,17 +14,15 @@ from typing import TYPE_CHECKING, Annotated, Any, get_origin
 import typer
 from typer.core import TyperCommand
 
+from lidardesign.choices.flag import Flag, flags_of
+from lidardesign.cli.terminal.output import command
 from lidardesign.errors import UNSET_HINT, ConfigError
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
 PACKAGE = Path(__file__).parents[2]
-
-
-def words(metavar: str) -> Callable[[], list[str]]:
-    """The choices that a metavar lists, as draft|standard|fine."""
-    return lambda: metavar.split("|")
+MOST_SHOWN = 10**9  # larger limits of whole numbers mean nothing to people
 
 
 def tasks() -> list[str]:
@@ -78,272 +79,60 @@ def _keys(model: type[BaseModel], prefix: str) -> Iterator[tuple[str, str]]:
             yield f"{prefix}{name}=", info.description or ""
 
 
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout, for errors too.")]
-Seed = Annotated[
-    int | None,
-    typer.Option("--seed", metavar="N", help="Seed of all random numbers.", show_default="the run's, or 0"),
-]
-Quiet = Annotated[
-    bool,
-    typer.Option("--quiet", "-q", help="Print no notes or progress; for a result in a file, only its path."),
-]
-Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Print everything: all tables and notes.")]
-Name = Annotated[str, typer.Option("--name", metavar="NAME", help="Name of the design: RUN/designs/NAME.yaml.")]
-Layout = Annotated[
-    str | None,
-    typer.Option(
-        "--layout",
-        metavar="chosen|even|spinning",
-        help="Rays chosen on training scenes, even in the field of view, or on chosen rings.",
-        show_default="the design's, else chosen; even where rays cannot be chosen",
-        autocompletion=words("chosen|even|spinning"),
-    ),
-]
-At = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--at",
-        metavar="NAME=VALUE",
-        help="Value of a condition, such as the robot's position x_m=0.37; exact, no window. Repeatable.",
-        show_default=False,
-    ),
-]
-RayCount = Annotated[
-    int | None,
-    typer.Option(
-        "--rays",
-        metavar="N",
-        min=1,
-        max=1_000_000,
-        help="Rays per frame, over all sensors.",
-        show_default="the task's numbers; even rays leave it open",
-    ),
-]
-Channels = Annotated[
-    int | None,
-    typer.Option(
-        "--channels",
-        metavar="N",
-        min=1,
-        help="Channels (chosen rings) per sensor in the layout spinning.",
-        show_default="the design's, else 16",
-    ),
-]
-Level = Annotated[
-    float | None,
-    typer.Option(
-        "--level",
-        metavar="SHARE",
-        help="Share of rays and returns that fields of view and gates contain, such as 0.99.",
-        show_default="the design's, else 0.999 for chosen rays and the task's for others",
-    ),
-]
-Gates = Annotated[
-    str | None,
-    typer.Option(
-        "--gates",
-        metavar="sensor|ray",
-        help="One gate per sensor, or one per ray.",
-        show_default="the design's, else sensor; ray where rays are chosen along a condition",
-        autocompletion=words("sensor|ray"),
-    ),
-]
-Sensors = Annotated[
-    str | None,
-    typer.Option(
-        "--sensors",
-        metavar="N|N-M|best",
-        help="Number of sensors; best: by the task's score on training scenes; N-M: of parts, a table and the best.",
-        show_default="the design's, else best",
-    ),
-]
-Parts = Annotated[
-    str | None,
-    typer.Option(
-        "--parts",
-        metavar="NAME,NAME|catalog",
-        help="Make the design of real parts (catalog names, NAME:MODE, part files), chosen with their poses; "
-        "--sensors says how many.",
-        show_default=False,
-    ),
-]
-Modules = Annotated[
-    int | None,
-    typer.Option("--modules", metavar="N", min=1, help="This many modules with --fov and --zones.", show_default=False),
-]
-ModuleField = Annotated[
-    str | None,
-    typer.Option("--fov", metavar="WxH", help="Module field of view in degrees, such as 45x45.", show_default=False),
-]
-ModuleZones = Annotated[
-    str | None, typer.Option("--zones", metavar="CxR", help="Module zones, such as 8x8.", show_default=False)
-]
-Detector = Annotated[
-    str,
-    typer.Option(
-        "--detector",
-        metavar="NAME|FILE",
-        help="The detector: ideal, single-photon, consumer-8x8, or a YAML file.",
-        autocompletion=detectors,
-    ),
-]
-Judge = Annotated[
-    str | None,
-    typer.Option(
-        "--detector",
-        metavar="NAME|FILE",
-        help="Judge sets of parts and numbers of sensors under a detector (see `evaluate`).",
-        show_default="ideal",
-        autocompletion=detectors,
-    ),
-]
-SceneSettings = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--set",
-        metavar="KEY=VALUE",
-        help="A key of the task: choose in scenes other than the learned ones; repeatable.",
-    ),
-]
-Weights = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--weight",
-        metavar="KEY=VALUE",
-        help="Weight the learned density for another setting of the task, such as importance; nothing is learned "
-        "again. Repeatable.",
-        show_default=False,
-    ),
-]
-Workers = Annotated[
-    str,
-    typer.Option(
-        "--workers",
-        metavar="N|tcp://HOST:PORT",
-        help="Look at scenes with this many processes on this machine, or with the workers of a dask scheduler (extra: "
-        "cluster). The results are the same.",
-    ),
-]
-Certify = Annotated[
-    bool,
-    typer.Option(
-        "--certify", help="Bound what any other choice could gain at every number of rays, not just the middle one."
-    ),
-]
-Survive = Annotated[
-    int | None,
-    typer.Option("--survive", metavar="0|1", help="1: allow for the loss of any one sensor.", show_default="0"),
-]
-Losses = Annotated[bool, typer.Option("--losses", help="Also score designs with each sensor lost in turn.")]
-Goal = Annotated[
-    float | None,
-    typer.Option(
-        "--goal", metavar="SCORE", help="Score to keep with as little as possible (see --least).", show_default=False
-    ),
-]
-LEAST = "bandwidth|rays|sensors|parts"
-Least = Annotated[
-    str | None,
-    typer.Option(
-        "--least", metavar=LEAST, help="What --goal minimises; by default bandwidth.", autocompletion=words(LEAST)
-    ),
-]
-Adaptive = Annotated[
-    int | None,
-    typer.Option("--adaptive", metavar="N", help="At most N patterns; returns pick the next one.", show_default="1"),
-]
-Preset = Annotated[
-    str | None,
-    typer.Option(
-        "--preset",
-        metavar="draft|standard|fine",
-        help="Effort: about ten seconds, half a minute, or minutes.",
-        show_default="standard",
-        autocompletion=words("draft|standard|fine"),
-    ),
-]
-Like = Annotated[
-    Path | None,
-    typer.Option(
-        "--like",
-        metavar="RIG",
-        readable=False,
-        help="Use no more than an existing rig (a design, rays as CSV or NPZ, a MuJoCo model, an SDF file): as many "
-        "sensors and rays, its places, fields of view and gates no wider. Your own constraints take precedence.",
-        show_default=False,
-    ),
-]
-SpaceOf = Annotated[
-    Path | None,
-    typer.Option(
-        "--in",
-        metavar="RUN",
-        help="Take the task, its scenes and the design space of this run, for designs of any origin.",
-        show_default="the run that designs came from",
-    ),
-]
-Overrides = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--set",
-        metavar="KEY=VALUE",
-        help="Set one value, such as density.sigma_m=0.002 (`tasks show TASK` lists keys); repeatable.",
-        show_default=False,
-        autocompletion=configuration_keys,
-    ),
-]
-ConfigFile = Annotated[
-    Path | None,
-    typer.Option(
-        "--config",
-        metavar="FILE",
-        help="YAML file with any of the sections task, space, density, learning.",
-        show_default=False,
-    ),
-]
+def typer_option(flag: Flag, **more: Any) -> Any:
+    """The type of a parameter that typer reads a flag from."""
+    kind: Any = list[flag.kind] | None if flag.is_repeated else flag.kind | None  # type: ignore[name-defined]
+    if isinstance(flag.default, bool):
+        kind = bool
+    offered = (lambda: list(flag.words)) if flag.words else globals()[flag.offers] if flag.offers else None
+    limits = f" {flag.low:,} to {flag.high:,}." if flag.kind is int and 1 < (flag.high or 0) <= MOST_SHOWN else ""
+    shown = flag.shown or (isinstance(flag.default, str | float | int) and not isinstance(flag.default, bool))
+    return Annotated[
+        kind,
+        typer.Option(
+            *flag.names.split(),
+            metavar=flag.metavar or "|".join(flag.words) or None,
+            help=flag.help + limits,
+            show_default=shown,
+            autocompletion=offered,
+            readable=False,
+            **more,
+        ),
+    ]
 
 
-def parse_at(texts: list[str] | None) -> dict[str, float]:
-    """The values of `--at`, as {"x_m": 0.37}; the design space checks their names.
+def command_line(*tables: type) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Decorate a command: it has the options of tables, of which the first that has a key counts.
 
-    Raises:
-        ConfigError: One is not NAME=VALUE with a finite number, or a name is given twice.
+    The command takes its `output`, its arguments, and the options that are given.
     """
-    from lidardesign.run.yaml import plain_number
+    flags = {key: flag for table in reversed(tables) for key, flag in flags_of(table).items()}
+    order = dict.fromkeys(key for table in tables for key in flags_of(table))
 
-    values: dict[str, float] = {}
-    for text in texts or []:
-        name, equals, value = (part.strip() for part in text.partition("="))
-        try:
-            number = plain_number(value)
-        except ValueError:
-            number = math.nan
-        if not (name and equals and math.isfinite(number)):
-            raise ConfigError(f"{text!r}", where="--at", allowed="NAME=VALUE with a finite number, such as x_m=0.37")
-        if name in values:
-            raise ConfigError(f"{name} is given twice: {values[name]:g} and {number:g}", where="--at")
-        values[name] = number
-    return values
+    def decorate(function: Callable[..., None]) -> Callable[..., None]:
+        signature = inspect.signature(function, eval_str=True)
+        plain = inspect.Parameter.POSITIONAL_OR_KEYWORD
+        parameters = [one for one in signature.parameters.values() if one.kind is plain and one.name != "output"]
+        for key in order:
+            default = inspect.Parameter.empty if flags[key].is_required else flags[key].default or None
+            kind = inspect.Parameter.KEYWORD_ONLY
+            parameters.append(inspect.Parameter(key, kind, default=default, annotation=typer_option(flags[key])))
 
+        @functools.wraps(function)
+        def called(**values: Any) -> None:
+            given = {key: value for key, value in values.items() if value is not None}
+            printed = {key: given.pop(key, False) for key in ("json", "quiet", "verbose")}
+            with command(**printed) as output:
+                for key, value in given.items():
+                    if key in flags:
+                        flags[key].check(value)
+                function(output, **given)
 
-def part_names(
-    parts: str | None, modules: int | None, fov: str | None, zones: str | None, sensors: str | None
-) -> tuple[list[str] | str | None, int | str | None]:
-    """The parts that are named, `catalog` for all that are shipped, or modules; and the number of sensors.
+        called.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+        called.__annotations__ = {one.name: one.annotation for one in parameters}
+        return called
 
-    Raises:
-        ConfigError: A name is empty, or a module lacks something.
-    """
-    if (modules, fov, zones) == (None, None, None):
-        names = [] if parts is None else [name.strip() for name in parts.split(",")]
-        if not all(names):
-            raise ConfigError(f"{parts!r} has an empty part name", where="--parts", allowed="NAME,NAME or catalog")
-        count = int(sensors) if sensors is not None and re.fullmatch("[0-9]{1,9}", sensors) else sensors
-        return (parts if parts in (None, "catalog") else names), count
-    if None in (modules, fov, zones) or (parts, sensors) != (None, None):
-        allowed = "--modules N --fov WxH --zones CxR, without --sensors and --parts"
-        raise ConfigError("the description of the modules is incomplete", where="--modules", allowed=allowed)
-    return [f"module-{fov}-{zones}"], modules
+    return decorate
 
 
 class StrictCommand(TyperCommand):

@@ -13,12 +13,12 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from lidardesign.limits import MOST_RAYS
 from lidardesign.numerics import EPSILON
 from lidardesign.scenes.rays import Rays, fire_times
 from lidardesign.scoring.scene_scores import RaysPerCondition
 from lidardesign.sensors.adaptive import mean_mbps
 from lidardesign.sensors.bandwidth import Bandwidth
-from lidardesign.sensors.sensor import MOST_RAYS
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction
 
 # A gate without width receives nothing, since gates are open at their end. Ranges that never vary get the width

@@ -26,6 +26,7 @@ from lidardesign.estimates import (
     relative_difference,
     worst_tenth,
 )
+from lidardesign.limits import MOST_RAYS
 from lidardesign.numerics import ROUNDING
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import Progress, phase
@@ -41,7 +42,6 @@ from lidardesign.scoring.scene_scores import RaysPerCondition, score_scenes, sil
 from lidardesign.sensors.adaptive import AdaptiveRays
 from lidardesign.sensors.compare import outside_notes
 from lidardesign.sensors.design_file import design_document
-from lidardesign.sensors.sensor import MOST_RAYS
 from lidardesign.simulate.calibration import light_notes
 from lidardesign.simulate.plan import EffectPlan, Planner
 from lidardesign.task import Metric, Score, notes_of

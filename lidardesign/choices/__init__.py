@@ -1,0 +1,1 @@
+"""Every option of every command, written once: the command line, the Python interface and help read it here."""
