@@ -19,9 +19,9 @@ from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import Outcome, Rays, gate_outcomes
 from lidardesign.scenes.scene import Body, Box, Mesh, Plane, Round, Scene
 from lidardesign.scenes.surface import BOX_CORNERS, BOX_QUADS, grid_faces, round_triangles
-from lidardesign.scoring.evaluation.entries import ordered_conditions
 from lidardesign.scoring.evaluation.request import EvaluationRequest, numbers_fired
 from lidardesign.scoring.evaluation.results import Evaluation
+from lidardesign.scoring.fired import fired
 from lidardesign.sensors.adaptive import AdaptiveRays
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import design_document
@@ -183,15 +183,14 @@ def evaluated_scene(evaluation: Evaluation, request: EvaluationRequest) -> Scene
         return design.count or max(numbers_fired(design, request.rays, request.alone))
 
     def laid_out(design: DesignSpec, at: Conditions) -> Rays:
-        lists = following.get(design.name)
-        if lists is not None:
-            return lists[min(int(at[PATTERN]), len(lists) - 1)]
-        return request.fired(design, number(design), {} if PATTERN in at else at)
+        lists = every[design.name]
+        return lists[min(places.index(at), len(lists) - 1)]
 
-    own = {design.name: (design, design.following(number(design))) for design in request.designs}
-    following = {name: request.following(*one) for name, one in own.items() if one[1] is not None}
+    places: Sequence[Conditions] = sorted(request.conditions, key=lambda condition: tuple(condition.values()))
+    how = places, request.planner, request.task
+    every = {design.name: fired(design, number(design), *how) for design in request.designs}
+    following = {name: lists for name, lists in every.items() if isinstance(lists, AdaptiveRays)}
     planner = request.planner if any(effect.on for effect in evaluation.effects) else None
-    places: Sequence[Conditions] = ordered_conditions(request)
     if following:
         places = [{PATTERN: pattern} for pattern in range(max(map(len, following.values())))]
     scene = request.test[0]
