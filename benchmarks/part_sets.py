@@ -13,7 +13,6 @@ import itertools
 import resource
 import time
 from functools import partial
-from types import SimpleNamespace
 from typing import Any
 
 import common  # noqa: F401 (before numpy: it limits the thread pools)
@@ -72,16 +71,15 @@ def designs_of(request: Any, training: Any, others: int) -> dict[str, Any]:
 
 def scored(run: Any, planner: Any, designs: dict[str, Any], count: int) -> tuple[np.ndarray, list[str]]:
     """Scores of designs (D, S) on so many held-out scenes, and the effects."""
-    from lidardesign.fitting.trials import HeldBackScenes, Trial
-    from lidardesign.simulate.calibration import with_part_light
+    from lidardesign.fitting.trials import Trial, effects_line, score_trials
+    from lidardesign.scoring.fired import fired
+    from lidardesign.scoring.scene_scores import TrainingScorer
 
     stream = itertools.chain.from_iterable(run.scenes("test", seed) for seed in itertools.count(run.config.seed))
-    scenes = list(itertools.islice(stream, count))
-    known = SimpleNamespace(run=run, seed=run.config.seed, first=lambda purpose: scenes)
-    trials = [Trial(0, (with_part_light(one.rays(), one, planner.detector),)) for one in designs.values()]
-    judge = HeldBackScenes(known, planner)
-    judge.score(trials, count)
-    return np.array([one.scores for one in trials]), judge.effects
+    trials = [Trial(0, fired(one, planner=planner)) for one in designs.values()]
+    scorer = TrainingScorer(run.task, run.metric, run.config.seed, stream, planner, plans_once=True)
+    score_trials(trials, scorer, count)
+    return np.array([one.scores for one in trials]), effects_line(scorer)
 
 
 def compared(options: Any, klux: float) -> dict[str, Any]:

@@ -69,15 +69,14 @@ def main() -> None:
     options = made.parse_args()
 
     from lidardesign.api.run import open_run
-    from lidardesign.api.training_scores import TrainingScores
     from lidardesign.simulate.returns import build_casters, simulate_many
     from lidardesign.studio.choices import SensorPose
     from lidardesign.studio.studio import Studio
 
     run = open_run(options.run)
-    # the fit and the scores, which a run takes without the page
+    # the fit and what designs see, which a run takes without the page
     design = run.fit(sensors=2, rays=options.rays, layout="even", name="even")
-    TrainingScores(run).score(design)
+    design.simulate(run.scenes("train", run.config.seed)[:20])
     before_mib = resident_mib()
     with Studio(run, design) as studio:
         client = Client(studio.address)

@@ -151,6 +151,11 @@ class Metric:
     best: float | None = None
 
     @property
+    def sign(self) -> float:
+        """1 where lower is better, else -1: what scores are multiplied with to be lower where they are better."""
+        return 1.0 if self.better == "lower" else -1.0
+
+    @property
     def limits(self) -> tuple[float, float]:
         """The least and the largest value, infinite where the best one is unknown."""
         if self.better == "higher":

@@ -27,7 +27,7 @@ from lidardesign.scoring.baselines.simple import ALWAYS, BASELINES, NONE, check_
 from lidardesign.scoring.evaluation.headline import check_audit, check_better, check_limit
 from lidardesign.scoring.evaluation.last_scores import SCORES, last_scores_of
 from lidardesign.scoring.evaluation.mounting import MountError
-from lidardesign.scoring.evaluation.request import EvaluationRequest, numbers_alone, usual_numbers
+from lidardesign.scoring.evaluation.request import EvaluationRequest, counts_without_baselines, usual_numbers
 from lidardesign.scoring.evaluation.results import Evaluation, Paired, Row, write_csv
 from lidardesign.scoring.evaluation.score import evaluate as score_designs
 from lidardesign.simulate.detector.files import load_detector
@@ -180,7 +180,7 @@ class ScoreRequest:
     @property
     def alone(self) -> list[int]:
         """See `EvaluationRequest`."""
-        return [] if self.choices["rays"] else numbers_alone(self.rays, self.run.task.defaults.rays)
+        return [] if self.choices["rays"] else counts_without_baselines(self.rays, self.run.task.defaults.rays)
 
     @property
     def cma_seconds(self) -> float:

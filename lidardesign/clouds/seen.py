@@ -18,15 +18,15 @@ from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.mesh_files import OTHER_FORMATS, SUFFIXES, Y_UP, load_mesh
 from lidardesign.scenes.rays import Returns
 from lidardesign.scenes.scene import Body, Round, Scene, inverse_rigid
-from lidardesign.scoring.evaluation.entries import entries_of
-from lidardesign.scoring.evaluation.request import EvaluationRequest
-from lidardesign.scoring.scene_scores import RaysPerCondition, returns_in_scene
+from lidardesign.scoring.evaluation.request import fired_numbers
+from lidardesign.scoring.fired import Positions, fired
+from lidardesign.scoring.scene_scores import returns_in_scene
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.sensor import Sensor
-from lidardesign.simulate.calibration import with_part_light
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.plan import Planner
 from lidardesign.simulate.returns import build_casters
+from lidardesign.task import Metric
 
 # Columns of a cloud with their types in files; points are rounded last.
 COLUMNS = (
@@ -179,9 +179,10 @@ class Measuring:
     detector: str = "ideal"
     seed: int | None = None
 
-    def planner(self) -> Planner:
-        """The rule by which effects are chosen: those that a scene calls for."""
-        return Planner(load_detector(self.detector))
+    def planner(self, metric: Metric | None = None) -> Planner:
+        """The rule by which effects are chosen: those that a scene calls for, and that a metric can tell."""
+        planner = Planner(load_detector(self.detector))
+        return planner if metric is None else replace(planner, tolerance=planner.tolerated.within(metric))
 
 
 @phase("simulation")
@@ -203,28 +204,21 @@ def seen_scenes(
         measuring: How it measures.
         settings: Keys of the task with values, for scenes other than the learned ones.
     """
-    run, planner = run.with_settings(settings), measuring.planner()
-    config = run.config
-    seed = config.seed if measuring.seed is None else measuring.seed
+    run = run.with_settings(settings)
+    planner, seed = measuring.planner(run.metric), run.config.seed if measuring.seed is None else measuring.seed
     chosen = run.scenes("test", seed)[:scenes] if isinstance(scenes, int) else scenes
-    request = EvaluationRequest(
-        task=run.task, config=config.task, space=config.space, seed=seed, designs=[design], rays=[count], baselines=(),
-        equal_bandwidth=False, test=chosen,
-        planner=replace(planner, tolerance=planner.tolerated.within(run.metric)),
-    )  # fmt: skip
-    entry = entries_of(request)[0]
-    return [_seen(design, scene, entry.lit_in(number), request.planner, seed) for number, scene in enumerate(chosen)]
+    positions = fired(design, *fired_numbers([design], [count]), run.conditions(), planner, run.task)
+    return [_seen(design, scene, positions, planner, seed) for scene in chosen]
 
 
 @phase("simulation")
 def seen_in_file(scene: Scene, design: DesignSpec, count: int, measuring: Measuring) -> SeenScene:
     """What a design sees in a scene of a user's own; arguments as of `seen_scenes`."""
     planner = measuring.planner()
-    fired = with_part_light(design.rays(count), design, planner.detector)
-    return _seen(design, scene, (fired,), planner, measuring.seed or 0)
+    return _seen(design, scene, fired(design, count, planner=planner), planner, measuring.seed or 0)
 
 
-def _seen(design: DesignSpec, scene: Scene, positions: RaysPerCondition, planner: Planner, seed: int) -> SeenScene:
+def _seen(design: DesignSpec, scene: Scene, positions: Positions, planner: Planner, seed: int) -> SeenScene:
     casters = build_casters(scene)
     plan = planner.plan(scene, list(positions), casters)
     found = returns_in_scene(scene, positions, casters, planner.physics(plan, seed))

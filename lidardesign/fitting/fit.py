@@ -33,7 +33,7 @@ from lidardesign.fitting.result import FitResult
 from lidardesign.formats.designs import relative_folder
 from lidardesign.mixture.fit import FitProblem, FittedSensors, fit_sensors
 from lidardesign.mixture.support import LEAST_SAMPLES, MOVED_SAMPLES, Retarget, at_condition, condition_text
-from lidardesign.rays.information import FEW_SCENES, checked_information, features_of
+from lidardesign.rays.information import FEW_SCENES, checked_information
 from lidardesign.rays.proposals import nearest_samples
 from lidardesign.rays.training_scenes import CHOICE, TrainingScenes
 from lidardesign.registry import plugin_guard
@@ -49,8 +49,8 @@ from lidardesign.task import mount_of, random_generator
 from lidardesign.workers import Starmap
 
 if TYPE_CHECKING:
-    from lidardesign.fitting.trials import HeldBackScenes
     from lidardesign.rays.pool import CandidatePool
+    from lidardesign.scoring.scene_scores import TrainingScorer
 
 # A larger share of scenes without information from a design is noted.
 MOST_SILENT = 0.5
@@ -240,12 +240,12 @@ class Fitter:
             )
 
     @cached_property
-    def scenes(self) -> HeldBackScenes:
-        """The scenes that all trials are scored on."""
+    def scorer(self) -> TrainingScorer:
+        """The scorer of all trials."""
         # scoring loads compiled loops, which a given number of sensors does without
-        from lidardesign.fitting.trials import HeldBackScenes
+        from lidardesign.fitting.trials import held_back_scorer
 
-        return HeldBackScenes(self.training, self.request.planner)
+        return held_back_scorer(self.training, self.request.planner)
 
     @cached_property
     def pool(self) -> CandidatePool | None:
@@ -298,7 +298,7 @@ class Fitter:
             return self._fitted(asked, certifies=False).design
 
         with phase("trials"):
-            search = GoalSearch(request, fit, self.scenes)
+            search = GoalSearch(request, fit, self.scorer)
             found = search.found(COUNTS)
         self.request = replace(found.request, goal=None)
         for note in search.notes(found):
@@ -414,7 +414,7 @@ class Fitter:
 
         They do where the gain is more than its standard error.
         """
-        from lidardesign.fitting.trials import Trial, best_of, trial_of
+        from lidardesign.fitting.trials import best_of, trial_of
 
         metric, adaptive = self.request.run.metric, design.adaptive
         if adaptive is None:
@@ -422,9 +422,8 @@ class Fitter:
             return design
         with phase("trials"):
             fixed = trial_of(self.request, design, len(adaptive))
-            features = features_of(self.training.run.task)
-            following = Trial(fixed.sensors, adaptive.rays(features)).lit(self.request, design)
-            best = best_of([fixed, following], self.scenes, metric, 0.0, most=2 * FEW_SCENES)
+            following = trial_of(self.request, design, len(adaptive), self.request.run.task)
+            best = best_of([fixed, following], self.scorer, metric, 0.0, most=2 * FEW_SCENES)
         before, after = fixed.scores.mean(), following.scores.mean()
         looks = f" behind a first look of {adaptive.rule.looks} rays" if adaptive.rule.looks else ""
         text = (
@@ -439,7 +438,7 @@ class Fitter:
 
     def _best_count(self) -> int:
         """The number of sensors that scores best on training scenes, with a note on those tried."""
-        from lidardesign.fitting.trials import best_of, trials_of
+        from lidardesign.fitting.trials import best_of, effects_line, trials_of
 
         request, metric = self.request, self.request.run.metric
         check_feasible(request.constraints, request.run.config.space, rays=request.rays)
@@ -453,11 +452,11 @@ class Fitter:
 
         with phase("trials"):
             trials = trials_of(request, fit, COUNTS)
-            best = best_of(trials, self.scenes, metric)
+            best = best_of(trials, self.scorer, metric)
         found = ", ".join(f"{one.sensors}: {one.scores.mean():.4g} in {one.mbps:.3g} Mbit/s" for one in trials)
         text = f"sensors: {best.sensors}; {metric.name} [{metric.unit}] on {len(best.scores)} training scenes "
         self.notes(BackgroundNote(f"{text}by their number: {found}"))
-        for line in self.scenes.effects:
+        for line in effects_line(self.scorer):
             self.notes(BackgroundNote(line))
         return best.sensors
 

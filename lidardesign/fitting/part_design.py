@@ -35,7 +35,7 @@ from lidardesign.fitting.part_shapes import (
 )
 from lidardesign.fitting.request import FitRequest
 from lidardesign.fitting.result import FitResult
-from lidardesign.fitting.trials import HeldBackScenes, Trial, best_of
+from lidardesign.fitting.trials import Trial, best_of, effects_line, held_back_scorer, score_trials
 from lidardesign.mixture.bounds import bounds_of, clip_azimuth
 from lidardesign.mixture.components import Axes
 from lidardesign.numerics import SLACK, TINY
@@ -49,12 +49,14 @@ from lidardesign.run.clock import phase
 from lidardesign.samples import Samples
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Scene
+from lidardesign.scoring.fired import fired
+from lidardesign.scoring.scene_scores import TrainingScorer
 from lidardesign.sensors.bandwidth import split_budget
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import MOST_FILE_RAYS
 from lidardesign.sensors.pattern import Pattern, low_discrepancy
 from lidardesign.sensors.sensor import DEFAULT_LEVEL, Sensor, interval_factor
-from lidardesign.simulate.calibration import reach_notes, with_part_light
+from lidardesign.simulate.calibration import reach_notes
 from lidardesign.simulate.detector.physics import IDEAL, Detector, check_windows
 from lidardesign.space import angles, observed_point
 from lidardesign.task import Metric, random_generator
@@ -137,16 +139,15 @@ def choose_parts(
         # sensors come in the order of their entries
         ordered = sorted((placed[member] for member in members), key=lambda one: one.entry)
         design = _design(request.name, constraints, ordered, budget.rays)
-        fired = (with_part_light(design.rays(), design, detector),)
-        return SetTrial(len(members), fired, members=members, bound=bound, design=design)
+        return SetTrial(len(members), fired(design, planner=planner), members=members, bound=bound, design=design)
 
     numbers, judged = range(request.fewest or count, count + 1), MOST_JUDGED * (1 if planner is None else 2)
     by_number = _sets_by_number(numbers, coverage, limits, chosen, judged, trial)
-    found = _judge_sets(by_number, HeldBackScenes(training, planner), request, notes, progress)
+    found = _judge_sets(by_number, held_back_scorer(training, planner), request, notes, progress)
     rows = [_row(one, placed) for one in found] if request.fewest else []
     for row in rows:
         notes(_row_text(row, request.run.metric))
-    sign = 1.0 if request.run.metric.better == "lower" else -1.0
+    sign = request.run.metric.sign
     winner = min(found, key=lambda one: sign * one.scores[: min(len(one.scores) for one in found)].sum())
     missing = {*range(len(constraints.each))} - {placed[member].entry for member in winner.members}
     if missing:
@@ -323,32 +324,32 @@ def _enough_scenes(
 
 def _judge_sets(
     by_number: Sequence[list[SetTrial]],
-    scenes: HeldBackScenes,
+    scorer: TrainingScorer,
     request: FitRequest,
     notes: Callable[[str], None],
     progress: Callable[[str], None],
 ) -> list[SetTrial]:
     """The best set of each number of parts by the task's score on training scenes that were held back."""
     trials, metric = [one for sets in by_number for one in sets], request.run.metric
-    if len(trials) == 1 and scenes.planner is None and not request.fewest:
+    if len(trials) == 1 and scorer.planner is None and not request.fewest:
         return trials
     few = max(information.FEW_SCENES // 4, 1)
     # together first: the effects are those that any of the sets calls for
     for number in range(1, few + 1):
         began = perf_counter()
-        scenes.score(trials, number)
+        score_trials(trials, scorer, number)
         left = (perf_counter() - began) * (few - number)
         progress(f"judging {len(trials)} sets of parts on the first {few} scenes, about {left:.0f} s for these")
     if all(abs(one.scores.mean() - metric.worst) <= metric.tolerance for one in trials):
         notes("none of the sets measures anything in these scenes: the best by the proxy is taken")
         return [sets[0] for sets in by_number]
-    most = min(max(JUDGED_FRAMES // scenes.scenes[0].frames, 2 * information.FEW_SCENES), information.MOST_SCENES)
-    found = [best_of(sets, scenes, metric, None, few, most) for sets in by_number]
+    most = min(max(JUDGED_FRAMES // scorer.scenes(1)[0].frames, 2 * information.FEW_SCENES), information.MOST_SCENES)
+    found = [best_of(sets, scorer, metric, None, few, most) for sets in by_number]
     for one, sets in zip(found, by_number, strict=True):
         text = f"{metric.name} [{metric.unit}] of {len(sets)} sets of {one.sensors} parts on training scenes"
         values = ", ".join(f"{each.scores[:few].mean():.4g}" for each in sets)
         notes(BackgroundNote(f"{text}, the best by the proxy first: {values}"))
-    for line in scenes.effects:
+    for line in effects_line(scorer):
         notes(line)
     return found
 

@@ -22,15 +22,14 @@ from lidardesign.rays.information import FEW_SCENES, MOST_SCENES
 from lidardesign.rays.selection import SHARE_PER_BANDWIDTH
 from lidardesign.rays.training_scenes import HELD_BACK, TrainingScenes
 from lidardesign.run.yaml import merged
-from lidardesign.scenes.rays import Rays
-from lidardesign.scenes.scene import Scene, group_numbers
-from lidardesign.scoring.scene_scores import score_lists, without_each
-from lidardesign.sensors.adaptive import mapped, mean_mbps
+from lidardesign.scenes.scene import group_numbers
+from lidardesign.scoring.fired import Positions, fired, without_each
+from lidardesign.scoring.scene_scores import TrainingScorer
+from lidardesign.sensors.adaptive import mean_mbps
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design import DesignSpec
-from lidardesign.simulate.plan import EffectPlan, Planner
-from lidardesign.simulate.returns import build_casters
-from lidardesign.task import Metric
+from lidardesign.simulate.plan import Planner
+from lidardesign.task import Metric, Task
 
 # Trials are compared to this share of the best score, or of its distance from the worst value, whichever is less.
 CLEAR_SHARE = 0.02
@@ -44,18 +43,18 @@ class Trial:
 
     Arguments:
         sensors: Its number of sensors.
-        fired: Its rays at each value of a condition.
+        fired: What it fires.
         survives: Whether the mean score over the loss of each sensor counts as much as that of all sensors.
         scores: Its score on each scene so far.
     """
 
     sensors: int
-    fired: tuple[Rays, ...]
+    fired: Positions
     survives: bool = False
     scores: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     @property
-    def lists(self) -> list[tuple[Rays, ...]]:
+    def lists(self) -> list[Positions]:
         """What is scored: all its rays and, where losses count, those that are left by the loss of each sensor."""
         return [self.fired, *(without_each(self.fired, self.sensors) if self.survives else [])]
 
@@ -64,79 +63,42 @@ class Trial:
         """Its bandwidth by the read-out model of evaluations [Mbit/s]."""
         return mean_mbps(self.fired, Bandwidth())
 
-    def lit(self, request: FitRequest, design: DesignSpec) -> Trial:
-        """The trial with the light that the request's detector has in parts of the design."""
-        if request.planner is None:
-            return self
-        from lidardesign.simulate.calibration import with_part_light
-
-        return replace(
-            self, fired=mapped(self.fired, lambda one: with_part_light(one, design, request.planner.detector))
-        )
-
-    def fires_as(self, other: Trial) -> bool:
+    def has_same_rays(self, other: Trial) -> bool:
         """True where another design fires the same rays."""
         names = ("origin_m", "direction", "gate_m", "sensor")
         mine, its = ([getattr(rays, name) for rays in one.fired for name in names] for one in (self, other))
         return all(map(np.array_equal, mine, its))
 
 
-class HeldBackScenes:
-    """The training scenes that trials are scored on, drawn as they are needed.
+def held_back_scorer(training: TrainingScenes, planner: Planner | None = None) -> TrainingScorer:
+    """The scorer of trials, on training scenes that were held back, under the effects that the first ones call for."""
+    run, first = training.run, training.first(HELD_BACK)
+    scenes = itertools.chain(first, training.scenes(HELD_BACK, len(first)))
+    return TrainingScorer(run.task, run.metric, training.seed, scenes, planner, plans_once=True)
 
-    Arguments:
-        training: The scenes.
-        planner: The detector; effects are chosen once, on the first scene for what is scored there.
-    """
 
-    def __init__(self, training: TrainingScenes, planner: Planner | None = None) -> None:
-        self.training, self.planner = training, planner
-        self.scenes: list[Scene] = []
-        self.plan: EffectPlan | None = None
+def score_trials(trials: Sequence[Trial], scorer: TrainingScorer, count: int) -> None:
+    """Score trials on the scenes up to `count` that each was not scored on yet."""
+    for number in range(min(len(trial.scores) for trial in trials), count):
+        missing = [trial for trial in trials if len(trial.scores) <= number]
+        lists = [trial.lists for trial in missing]
+        found = iter(scorer.scores_in(number, [*itertools.chain(*lists)], [trial.fired for trial in missing]))
+        for trial, own in zip(missing, lists, strict=True):
+            values = [next(found) for _ in own]
+            trial.scores = np.append(trial.scores, (values[0] + np.mean(values[1:] or values)) / 2)
 
-    @property
-    def groups(self) -> np.ndarray:
-        """The group of each scene so far."""
-        return group_numbers(self.scenes)
 
-    def score(self, trials: Sequence[Trial], count: int) -> None:
-        """Score trials on the scenes up to `count` that each was not scored on yet."""
-        run, known = self.training.run, len(self.scenes)
-        few = self.training.first(HELD_BACK)
-        self.scenes += (
-            few[known:count]
-            if count <= len(few)
-            else itertools.islice(self.training.scenes(HELD_BACK, known), max(count - known, 0))
-        )
-        for number in range(min(len(trial.scores) for trial in trials), count):
-            scene, missing = self.scenes[number], [trial for trial in trials if len(trial.scores) <= number]
-            casters, lists, physics = build_casters(scene), [trial.lists for trial in missing], None
-            if self.planner is not None:
-                if self.plan is None:
-                    plan = self.planner.plan(scene, [rays for trial in missing for rays in trial.fired], casters)
-                    # an effect that takes a thousand times as long as others is left out, and its bound is kept
-                    self.plan = replace(
-                        plan,
-                        decisions=tuple(replace(one, on=one.on and one.name != "multipath") for one in plan.decisions),
-                    )
-                physics = self.planner.physics(self.plan, self.training.seed)
-            jobs = list(itertools.chain(*lists))
-            found = iter(score_lists(run.task, run.metric, scene, jobs, casters, physics))
-            for trial, own in zip(missing, lists, strict=True):
-                values = [next(found)[0].value for _ in own]
-                trial.scores = np.append(trial.scores, (values[0] + np.mean(values[1:] or values)) / 2)
-
-    @property
-    def effects(self) -> list[str]:
-        """A line on the effects that were simulated and what skipped ones could change; none without a detector."""
-        if self.plan is None:
-            return []
-        skipped = [one.bound for one in self.plan.decisions if not one.on]
-        range_m, lost = sum(one.range_m for one in skipped), min(sum(one.lost for one in skipped), 1.0)
-        return [
-            f"judged under {self.planner.detector.name} with {', '.join(sorted(self.plan.effects)) or 'no effects'}; "
-            f"the skipped ones could change ranges by {1000 * range_m:.3g} mm and {lost:.2%} of the returns at most"
-        ]
+def effects_line(scorer: TrainingScorer) -> list[str]:
+    """A line on the effects that trials met and what skipped ones could change; none without a detector."""
+    if not scorer.plans:
+        return []
+    plan = scorer.plans[0]
+    skipped = [one.bound for one in plan.decisions if not one.on]
+    range_m, lost = sum(one.range_m for one in skipped), min(sum(one.lost for one in skipped), 1.0)
+    return [
+        f"judged under {scorer.planner.detector.name} with {', '.join(sorted(plan.effects)) or 'no effects'}; "
+        f"the skipped ones could change ranges by {1000 * range_m:.3g} mm and {lost:.2%} of the returns at most"
+    ]
 
 
 def trials_of(request: FitRequest, fit: Callable[[FitRequest], DesignSpec], counts: Sequence[int]) -> list[Trial]:
@@ -173,16 +135,16 @@ def allowed_counts(constraints: Constraints, counts: Sequence[int]) -> list[int]
     return [count for count in counts if low <= count <= high] or [low]
 
 
-def trial_of(request: FitRequest, design: DesignSpec, rays: int | None) -> Trial:
-    """A design with so many rays, or its own, wherever the request's sensors are."""
+def trial_of(request: FitRequest, design: DesignSpec, rays: int | None, task: Task | None = None) -> Trial:
+    """A design with so many rays, or its own, wherever the request's sensors are; the rest as for `fired`."""
     run = request.run
     conditions = [{**request.at, **one} for one in run.conditions(run.config.space.at(request.at))]
-    return Trial(len(design.sensors), tuple(design.rays(rays, at=at or None) for at in conditions)).lit(request, design)
+    return Trial(len(design.sensors), fired(design, rays, conditions, request.planner, task))
 
 
 def best_of(
     trials: Sequence[Trial],
-    scenes: HeldBackScenes,
+    scorer: TrainingScorer,
     metric: Metric,
     price: float | None = SHARE_PER_BANDWIDTH,
     few: int | None = None,
@@ -194,31 +156,31 @@ def best_of(
 
     Arguments:
         trials: By ascending number of sensors.
-        scenes: The scenes.
+        scorer: Scores them on training scenes.
         metric: The metric of their scores.
         price: The price of bandwidth, as in a choice of rays: ten percent more of it must bring two percent of the best
             score, or of its distance from the worst value, whichever is less. None: bandwidth is free, and the best by
             the mean is taken.
         few, most: On how many scenes all trials are scored, and the last ones at most; else as in a choice of rays.
     """
-    scenes.score(trials, few or FEW_SCENES)
+    score_trials(trials, scorer, few or FEW_SCENES)
     while True:
         count = len(trials[0].scores)
-        lost, errors, scale = _losses(trials, scenes.groups[:count], metric, price or 0.0)
+        lost, errors, scale = _losses(trials, group_numbers(scorer.scenes(count)), metric, price or 0.0)
         open_trials = [trial for trial, mean, error in zip(trials, lost, errors, strict=True) if mean <= 2 * error]
         is_clear = errors[lost <= 2 * errors].max() <= CLEAR_SHARE * scale
         if len(open_trials) == 1 or is_clear or 2 * count > (most or MOST_SCENES):
             allowed = 0 * errors if price is None else errors
             return next(trial for trial, mean, error in zip(trials, lost, allowed, strict=True) if mean <= error)
         trials = open_trials
-        scenes.score(trials, 2 * count)
+        score_trials(trials, scorer, 2 * count)
 
 
 def _losses(
     trials: Sequence[Trial], groups: np.ndarray, metric: Metric, price: float
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """By how much each trial is worse than the best, with standard errors, and the scale of what matters."""
-    sign = 1.0 if metric.better == "lower" else -1.0
+    sign = metric.sign
     score = sign * min(sign * trial.scores.mean() for trial in trials)
     scale = min(abs(score), abs(metric.worst - score))
     costs = [sign * trial.scores + price * scale * math.log(trial.mbps) for trial in trials]
@@ -276,11 +238,11 @@ class GoalSearch:
     Arguments:
         request: What is asked for, with a goal; the number of sensors is known where it is not what is sought.
         fit: Fits the design of a request.
-        scenes: The scenes, which all designs share.
+        scorer: Scores all designs.
     """
 
-    def __init__(self, request: FitRequest, fit: Callable[[FitRequest], DesignSpec], scenes: HeldBackScenes) -> None:
-        self.request, self.metric, self.scenes, self._fit = request, request.run.metric, scenes, fit
+    def __init__(self, request: FitRequest, fit: Callable[[FitRequest], DesignSpec], scorer: TrainingScorer) -> None:
+        self.request, self.metric, self.scorer, self._fit = request, request.run.metric, scorer, fit
         self._model = request.constraints.budget.readout
         self.tried: list[GoalTrial] = []
         self._refused: InfeasibleError | None = None
@@ -345,7 +307,7 @@ class GoalSearch:
         trial = self._fitted(request)
         if trial is None:
             return None
-        same = next((one for one in self.tried if one.trial.fires_as(trial)), None)
+        same = next((one for one in self.tried if one.trial.has_same_rays(trial)), None)
         cost = {"bandwidth": self._mbps(trial), "rays": len(trial.fired[0])}.get(request.least, trial.sensors)
         tried = replace(same, request=request) if same else GoalTrial(request, cost, trial, *self._judged(trial))
         self.tried.append(tried)
@@ -355,8 +317,9 @@ class GoalSearch:
         """The mean score of a design with its interval, and whether that keeps the goal."""
         goal, count = self.request.goal or 0.0, FEW_SCENES
         while True:
-            self.scenes.score([trial], count)
-            score = mean_interval(trial.scores, self.scenes.groups[:count], limits=self.metric.limits)
+            score_trials([trial], self.scorer, count)
+            groups = group_numbers(self.scorer.scenes(count))
+            score = mean_interval(trial.scores, groups, limits=self.metric.limits)
             low, high = (score.mean if end is None else end for end in score[1:])
             if not low <= goal <= high or 2 * count > MOST_SCENES:
                 return score, high <= goal if self.metric.better == "lower" else low >= goal

@@ -84,8 +84,7 @@ def correlation_sentence(pairs: Points, evaluation: Evaluation) -> str:
         return ""
     from scipy.stats import spearmanr
 
-    sign = 1 if evaluation.metric.better == "lower" else -1
-    correlation = float(spearmanr(losses, sign * scores).statistic)
+    correlation = float(spearmanr(losses, evaluation.metric.sign * scores).statistic)
     return (
         f"Proxy and score have a rank correlation (Spearman) of {correlation:.2f} over {len(pairs)} choices; 1 means "
         "that both rank them alike. More rays are better for both."

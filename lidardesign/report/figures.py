@@ -118,7 +118,7 @@ def log_ticks(values: Sequence[float]) -> list[float]:
 
 def far_baselines(evaluation: Evaluation) -> set[str]:
     """Names of baselines far worse than all designs at every number of rays, to hide at first in a plot."""
-    sign, baseline = (1.0 if evaluation.metric.better == "lower" else -1.0), evaluation.strongest_baseline
+    sign, baseline = evaluation.metric.sign, evaluation.strongest_baseline
     worst: dict[int, float] = {}
     for row in evaluation.rows:
         if not row.baseline:

@@ -2,6 +2,8 @@
 
 A scene is the unit of work: all its rays are planned and traced together, and its scores depend on nothing else. So
 scenes can be scored one after the other here, or by workers (`lidardesign.workers`), to the same numbers.
+
+On training scenes sets of rays come one after the other; the effects are those that the first of them called for.
 """
 
 from __future__ import annotations
@@ -9,9 +11,9 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from functools import cache
 
 import numpy as np
 
@@ -22,6 +24,7 @@ from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import Rays, Returns
 from lidardesign.scenes.scene import Scene
 from lidardesign.scenes.triangles import SecondCasts
+from lidardesign.scoring.fired import Positions
 from lidardesign.sensors.adaptive import AdaptiveRays, returns_of
 from lidardesign.simulate.detector.physics import Physics
 from lidardesign.simulate.plan import EffectPlan, Planner
@@ -29,38 +32,6 @@ from lidardesign.simulate.returns import build_casters, simulate_many
 from lidardesign.task import Metric, Score, Task
 from lidardesign.workers import Starmap
 
-RaysPerCondition = tuple[Rays, ...]  # one list of rays per condition value, in the task's order
-
-
-class Devices(NamedTuple):
-    """The devices that the rays of a baseline are of: as many as those of the design beside it.
-
-    Arguments:
-        number: Each fires every so many-th ray.
-        light: Of their emitters as a multiple of the detector's, the mean over the design's rays; None: 1.
-    """
-
-    number: int = 1
-    light: float | None = None
-
-    @classmethod
-    def of(cls, positions: RaysPerCondition) -> Devices:
-        """The devices of a design by its rays."""
-        rays = Rays.joined(positions)
-        return cls(max(len(np.unique(rays.sensor)), 1), None if rays.light is None else float(rays.light.mean()))
-
-    def firing(self, positions: RaysPerCondition) -> RaysPerCondition:
-        """Rays of one sensor as rays of these devices; those that have sensors keep them."""
-        if self == ONE_DEVICE or any(rays.sensor.any() for rays in positions):
-            return positions
-        light = [None if self.light is None else np.full(len(rays), self.light) for rays in positions]
-        return tuple(
-            replace(rays, sensor=np.arange(len(rays)) % self.number, light=own)
-            for rays, own in zip(positions, light, strict=True)
-        )
-
-
-ONE_DEVICE = Devices()
 # Rays times frames that are traced together: their returns take 24 bytes each.
 MOST_RETURNS = 4_000_000
 # Frames that are checked for returns from targets; a larger share without any is noted.
@@ -71,7 +42,7 @@ def score_lists(
     task: Task,
     metric: Metric,
     scene: Scene,
-    jobs: Sequence[RaysPerCondition],
+    jobs: Sequence[Positions],
     casters: Sequence[SceneCaster],
     physics: Physics | None = None,
 ) -> Iterator[tuple[Score, float]]:
@@ -110,29 +81,24 @@ def score_lists(
 
 
 def returns_in_scene(
-    scene: Scene, positions: RaysPerCondition, casters: Sequence[SceneCaster], physics: Physics | None
+    scene: Scene, positions: Positions, casters: Sequence[SceneCaster], physics: Physics | None
 ) -> list[Returns]:
     """The returns by which `score_lists` scores one set of rays."""
     found = simulate_many(scene, positions, casters=casters, physics=physics, repeats=_repeats(positions))
     return returns_of(positions, scene, found)
 
 
-def _repeats(positions: RaysPerCondition) -> Sequence[int]:
+def _repeats(positions: Positions) -> Sequence[int]:
     """The random draw of each list of rays: another at every condition value, the same for patterns of one frame."""
     return [0] * len(positions) if isinstance(positions, AdaptiveRays) else range(len(positions))
 
 
-def without_each(positions: RaysPerCondition, sensors: int) -> list[RaysPerCondition]:
-    """The rays that are left without each of a number of sensors, one after the other."""
-    return [tuple(rays.subset(np.flatnonzero(rays.sensor != lost)) for rays in positions) for lost in range(sensors)]
-
-
-def _count(positions: RaysPerCondition) -> int:
+def _count(positions: Positions) -> int:
     return sum(len(rays) for rays in positions)
 
 
-def _groups(jobs: Sequence[RaysPerCondition], frames: int) -> Iterator[list[RaysPerCondition]]:
-    group: list[RaysPerCondition] = []
+def _groups(jobs: Sequence[Positions], frames: int) -> Iterator[list[Positions]]:
+    group: list[Positions] = []
     size = 0
     for positions in jobs:
         returns = _count(positions) * frames
@@ -199,7 +165,7 @@ def _is_number(value: object) -> bool:
     return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
 
 
-def silent_notes(scenes: Sequence[Scene], fired: Mapping[str, RaysPerCondition]) -> list[str]:
+def silent_notes(scenes: Sequence[Scene], fired: Mapping[str, Positions]) -> list[str]:
     """Lines on sets of rays that have no return from any target in most of a few scenes and frames.
 
     Arguments:
@@ -248,7 +214,7 @@ def score_scenes(
     metric: Metric,
     seed: int,
     scenes: Sequence[Scene],
-    fired: Callable[[int], Sequence[RaysPerCondition]],
+    fired: Callable[[int], Sequence[Positions]],
     planner: Planner,
     plans: Sequence[EffectPlan] = (),
     progress: Progress | None = None,
@@ -286,7 +252,7 @@ def score_in_scene(
     task: Task,
     metric: Metric,
     scene: Scene,
-    lists: Sequence[RaysPerCondition],
+    lists: Sequence[Positions],
     planner: Planner,
     known: EffectPlan | None,
     seed: int,
@@ -316,3 +282,79 @@ def score_in_scene(
         list(score_lists(task, metric, scene, lists, casters, planner.physics(plan, seed))),
         sum((caster.second_casts for caster in casters), SecondCasts()),
     )
+
+
+class TrainingScorer:
+    """Scores sets of rays on training scenes, which are drawn as they are needed.
+
+    The rays that are scored first in a scene say which effects it calls for; all that come later meet the same ones.
+
+    Arguments:
+        task: The task that scores.
+        metric: Its metric.
+        seed: Root of the effects' random streams.
+        scenes: The scenes.
+        planner: The detector, and how effects are chosen; None: geometry alone.
+        plans_once: Whether the first scene says so for all, and multipath light, which takes a thousand times as long
+            as other effects, is left out.
+        keeps_casters: Whether the casters of all scenes are kept, for many sets one after the other.
+
+    `plans` has the effects by the number of the scene.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        metric: Metric,
+        seed: int,
+        scenes: Iterable[Scene],
+        planner: Planner | None,
+        *,
+        plans_once: bool = False,
+        keeps_casters: bool = False,
+    ) -> None:
+        self.task, self.metric, self.seed, self.planner = task, metric, seed, planner
+        self.plans: dict[int, EffectPlan] = {}
+        self._drawn: list[Scene] = []
+        self._further = iter(scenes)
+        self._plans_once = plans_once
+        self._casters = cache(build_casters) if keeps_casters else build_casters
+
+    def scenes(self, count: int) -> list[Scene]:
+        """The first scenes, all where there are no more."""
+        self._drawn += itertools.islice(self._further, max(count - len(self._drawn), 0))
+        return self._drawn[:count]
+
+    def scores(self, lists: Sequence[Positions], count: int) -> np.ndarray:
+        """The score of every set of rays in each of the first scenes, shape (scenes, sets)."""
+        return np.array([self.scores_in(number, lists) for number in range(len(self.scenes(count)))])
+
+    def scores_in(
+        self, number: int, lists: Sequence[Positions], planned: Sequence[Positions] | None = None
+    ) -> list[float]:
+        """The score of every set of rays in a scene.
+
+        Arguments:
+            number: The number of the scene.
+            lists: The sets of rays.
+            planned: Those that say which effects the scene calls for; None: all of them.
+        """
+        scene = self.scenes(number + 1)[number]
+        casters = self._casters(scene)
+        physics = self._physics(number, planned or lists, casters)
+        found = score_lists(self.task, self.metric, scene, lists, casters, physics)
+        return [score.value for score, _ in found]
+
+    def _physics(self, number: int, lists: Sequence[Positions], casters: Sequence[SceneCaster]) -> Physics | None:
+        """The effects that a scene calls for, which sets of rays say where they are the first."""
+        if self.planner is None:
+            return None
+        planned = 0 if self._plans_once else number
+        if planned not in self.plans:
+            plan = self.planner.plan(self._drawn[number], [rays for one in lists for rays in one], casters)
+            if self._plans_once:
+                # the bound is kept
+                kept = (replace(one, on=one.on and one.name != "multipath") for one in plan.decisions)
+                plan = replace(plan, decisions=tuple(kept))
+            self.plans[planned] = plan
+        return self.planner.physics(self.plans[planned], self.seed)

@@ -6,7 +6,7 @@ import threading
 from collections import Counter
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
+from functools import cache, lru_cache, partial
 from html import escape
 from pathlib import Path
 from queue import SimpleQueue
@@ -17,20 +17,22 @@ import numpy as np
 from lidardesign.api.design import Design
 from lidardesign.api.run import FIXED_BASELINES, Run
 from lidardesign.api.scores import Scores
-from lidardesign.api.training_scores import TrainingScores
-from lidardesign.clouds.seen import SeenScene
+from lidardesign.clouds.seen import Measuring, SeenScene
 from lidardesign.constraints.origins import SAME_PLACE_M, place_text
 from lidardesign.errors import BackgroundNote, ConfigError, LidardesignError
-from lidardesign.estimates import Interval, figure_and_interval
+from lidardesign.estimates import Interval, figure_and_interval, mean_interval, paired_difference
 from lidardesign.fitting.options import check_name
 from lidardesign.formats.registry import EXPORTERS
 from lidardesign.parts.catalogue import load_library
+from lidardesign.rays.training_scenes import TrainingScenes
 from lidardesign.report.figures import OUTCOME_WORDS
 from lidardesign.run.manifest import locked_run, write_recorded
 from lidardesign.run.yaml import dump_yaml
 from lidardesign.run_folder import ignore
 from lidardesign.samples import load_samples
-from lidardesign.scenes.scene import Scene
+from lidardesign.scenes.scene import Scene, group_numbers
+from lidardesign.scoring.fired import fired
+from lidardesign.scoring.scene_scores import TrainingScorer
 from lidardesign.sensors.adaptive import mean_mbps
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.space import observed_point
@@ -43,6 +45,9 @@ from lidardesign.task import Metric, random_generator
 DENSITY_POINTS = 3000
 MOST_UNDONE = 100
 ABOUT_BASELINES = "Baselines fire as many rays, each wherever it likes: no part or limit holds for them."
+PURPOSE = "comparison"  # of the stream of training scenes: fits choose and hold back scenes of other streams
+SCENES = 20
+MOST_KEPT = 100  # designs whose scores are known
 NAME = "studio"  # of designs that are not saved yet
 CONSTRAINTS = "constraints"  # the folder of constraint files in a run
 
@@ -72,7 +77,7 @@ class Studio:
         self._handle, self._scope, self._blind_is_shown = NONE, EVERY, False
         self._reference, self._beside = self.choices.design, None
         self._scenes: dict[tuple[str, tuple[str, ...]], list[Scene]] = {}
-        self._training: dict[tuple[str, tuple[str, ...]], TrainingScores] = {}
+        self._scorer, self._training_scores = cache(self._new_scorer), lru_cache(MOST_KEPT)(self._scores_of)
         self._stops, self._ended = threading.Event(), SimpleQueue()
         self._server, self._guard = start_server(port)
         self._page, self._answers = (Worker(f"studio {name}", self._failed) for name in ("page", "answers"))
@@ -341,20 +346,32 @@ class Studio:
             self._page.ask("blind", partial(self._stage.show_blind, *surface))
 
     def _score(self, choices: Choices, beside: Design | None) -> None:
-        key, metric = (choices.detector, choices.settings), self.run.metric
-        if key not in self._training:
-            self._training[key] = TrainingScores(self.run, detector=choices.detector, settings=choices.settings)
-        scores = self._training[key]
+        metric, world = self.run.metric, (choices.detector, choices.settings)
+        values = self._training_scores(choices.design, *world)
+        how = {"groups": group_numbers(self._scorer(*world).scenes(SCENES)), "limits": metric.limits}
         lines = [
-            f"{_figure(scores.score(choices.design), metric.unit)} {metric.name}, {metric.better} is better, "
-            f"on {len(scores.scenes)} training scenes kept for comparing"
+            f"{_figure(mean_interval(values, **how), metric.unit)} {metric.name}, {metric.better} is better, "
+            f"on {len(values)} training scenes kept for comparing"
         ]
         lines += [
-            f"{_compared(scores.difference(choices.design, other), metric)} than {name}"
+            f"{_compared(paired_difference(values, self._training_scores(other, *world), **how), metric)} than {name}"
             for name, other in (("before the last change", self._reference), (beside and beside.name, beside))
             if other is not None and other is not choices.design
         ]
         self._page.ask("scored", partial(self._show_status, choices, lines))
+
+    def _new_scorer(self, detector: str, settings: tuple[str, ...]) -> TrainingScorer:
+        """A scorer of training scenes that no fit chooses on, the same for all designs; others are left for scores."""
+        run = self.run.with_settings(settings)
+        scenes = TrainingScenes(run, run.config.seed).scenes(PURPOSE)
+        planner = Measuring(detector).planner(run.metric)
+        return TrainingScorer(run.task, self.run.metric, run.config.seed, scenes, planner)
+
+    def _scores_of(self, design: Design, detector: str, settings: tuple[str, ...]) -> np.ndarray:
+        """The score of a design in each of these scenes."""
+        run, scorer = self.run.with_settings(settings), self._scorer(detector, settings)
+        rays = fired(design.specification, design.usual_count(ignore), run.conditions(), scorer.planner, run.task)
+        return scorer.scores([rays], SCENES)[:, 0]
 
     def _show_status(self, choices: Choices, lines: list[str]) -> None:
         if choices.design is self.choices.design:

@@ -12,7 +12,13 @@ from support.command_line import make_run
 
 from lidardesign.errors import ConfigError
 from lidardesign.scenes.rays import Rays
-from lidardesign.scoring.evaluation.request import fired_numbers, left_out, numbers_alone, numbers_fired, usual_numbers
+from lidardesign.scoring.evaluation.request import (
+    counts_without_baselines,
+    fired_numbers,
+    missing_row_notes,
+    numbers_fired,
+    usual_numbers,
+)
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import save_design
 from lidardesign.sensors.pattern import Pattern
@@ -41,12 +47,12 @@ def test_a_pattern_is_left_out_beyond_its_rays_and_the_others_are_not():
     assert fired_numbers(designs, (30, 7, 30)) == [30, 7]
     assert fired_numbers(designs[:2], (7, 30)) == [7]
     assert fired_numbers([], (7, 30)) == [7, 30]
-    assert [(note.split()[0], note.split(": ")[1]) for note in left_out(designs, (7, 10, 30))] == [
+    assert [(note.split()[0], note.split(": ")[1]) for note in missing_row_notes(designs, (7, 10, 30))] == [
         ("few", "it is left out at 10 and 30 rays"),
         ("more", "at 7 and 10 rays an even subset of them"),
         ("more", "it is left out at 30 rays"),
     ]
-    assert "no design fires 10 or 30 rays" in left_out(designs[:1], (7, 10, 30))[-1]
+    assert "no design fires 10 or 30 rays" in missing_row_notes(designs[:1], (7, 10, 30))[-1]
     for some, numbers, words in ((2, (21, 30), "no design fires 21 or 30"), (1, (8,), "(?s)few does not fire 8.* 7")):
         with pytest.raises(ConfigError, match=words):
             fired_numbers(designs[:some], numbers)
@@ -64,10 +70,10 @@ def test_a_pattern_is_left_out_beyond_its_rays_and_the_others_are_not():
     ],
 )
 def test_a_pattern_fires_all_its_rays_and_a_huge_one_nobody_elses(count, layout, asked, fired):
-    alone = numbers_alone(asked, (10, 30))
+    alone = counts_without_baselines(asked, (10, 30))
     assert alone == [number for number in asked if number == 3000]
     assert numbers_fired(pattern("one", count, layout), asked, alone) == fired
-    cut = [line for line in left_out([pattern("one", count, layout)], asked) if "subset" in line]
+    cut = [line for line in missing_row_notes([pattern("one", count, layout)], asked) if "subset" in line]
     assert bool(cut) == (layout == "fixed" and bool(fired) and count not in asked)
 
 

@@ -22,9 +22,9 @@ from lidardesign.parts.catalogue import Pose, find_part, part_design
 from lidardesign.scoring.baselines import cma
 from lidardesign.scoring.baselines.candidates import rays_at
 from lidardesign.scoring.baselines.cma import CmaCandidate, CmaSettings, MovableSensors
-from lidardesign.scoring.baselines.views import TrainingObjective
 from lidardesign.scoring.evaluation.entries import entries_of
 from lidardesign.scoring.evaluation.score import evaluate
+from lidardesign.scoring.scene_scores import TrainingScorer
 from lidardesign.sensors.adaptive import mean_mbps
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design import DesignSpec
@@ -250,8 +250,8 @@ def test_a_design_that_does_not_fire_a_number_of_rays_is_not_followed_there():
 def candidate_of(name, settings=FAST, seed=0, scenes=AHEAD):
     design, space = FOLLOWED[name]
     model = movable(name)
-    objective = TrainingObjective(AnyMissTask(), AnyMissTask.metric, scenes, Planner(), 0)
-    return CmaCandidate(design, {12: model.start}, space, objective, settings, seed, Bandwidth())
+    scorer = TrainingScorer(AnyMissTask(), AnyMissTask.metric, 0, scenes, Planner(), keeps_casters=True)
+    return CmaCandidate(design, {12: model.start}, space, scorer, settings, seed, Bandwidth())
 
 
 def test_the_same_seed_and_number_of_evaluations_give_the_same_bytes():

@@ -20,7 +20,6 @@ from lidardesign.fitting import request as requests
 from lidardesign.fitting import trials as tried
 from lidardesign.fitting.request import CHOSEN_LEVEL, FitRequest
 from lidardesign.run_folder import RunFolder
-from lidardesign.scenes.scene import group_numbers
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.task import Metric
 
@@ -176,8 +175,9 @@ class Known(tried.Trial):
 
 
 def trial(sensors, *scores, mbps=1.0):
-    found = Known(sensors, ())
-    found.later, found.mbps = np.array(scores, dtype=float), mbps
+    # what it fires are its scores
+    found = Known(sensors, tuple(map(float, scores)))
+    found.mbps = mbps
     return found
 
 
@@ -185,17 +185,13 @@ class Repeated:
     """Scenes that repeat as often as they are asked for, with the scores that trials have on them."""
 
     def __init__(self, scenes):
-        self.few, self.scenes = list(scenes), []
+        self.few = list(scenes)
 
-    @property
-    def groups(self):
-        return group_numbers(self.scenes)
+    def scenes(self, count):
+        return [self.few[number % len(self.few)] for number in range(count)]
 
-    def score(self, trials, count):
-        times = -(-(count - len(self.scenes)) // len(self.few))
-        self.scenes += times * self.few
-        for one in trials:
-            one.scores = np.append(one.scores, np.tile(one.later, times))
+    def scores_in(self, number, lists, planned):
+        return [scores[number % len(self.few)] for scores in lists]
 
 
 def best_of(trials, scenes, better="lower", worst=100.0, most=4, **price):

@@ -15,7 +15,7 @@ from lidardesign.estimates import worst_tenth
 from lidardesign.rays.certificate import certify
 from lidardesign.rays.choice import RayCounts, choose
 from lidardesign.rays.coverage import LARGEST, LOSS_SHARE, MOST_LOSSES
-from lidardesign.scoring.scene_scores import without_each
+from lidardesign.scoring.fired import without_each
 from lidardesign.sensors.design_file import design_document, design_text
 
 seeds = st.integers(0, 10_000)

@@ -14,7 +14,7 @@ from support.synthetic_light import PHOTON_EFFECTS
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Ambient, Body, Medium, Scene, Sphere
 from lidardesign.scoring.evaluation.entries import entries_of
-from lidardesign.scoring.scene_scores import ONE_DEVICE, Devices
+from lidardesign.scoring.fired import ONE_DEVICE, Devices, assign_devices
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.detector.physics import Physics
@@ -106,14 +106,14 @@ def test_light_stays_with_rays_that_are_picked_or_joined():
 class TestDevicesOfBaselines:
     def test_share_their_rays_alternately_with_the_mean_light(self):
         lit = replace(two_sensors(3), light=np.repeat([0.5, 1.5], 3))
-        (fired,) = Devices.of((lit,)).firing((fan(5),))
+        (fired,) = assign_devices((fan(5),), Devices.of((lit,)))
         assert fired.sensor.tolist() == [0, 1, 0, 1, 0]
         assert (fired.light == 1).all()
 
     def test_change_neither_the_rays_of_one_device_nor_those_of_sensors(self):
         one, several = (fan(),), (two_sensors(),)
-        assert ONE_DEVICE.firing(one) is one
-        assert Devices(3).firing(several) is several
+        assert assign_devices(one, ONE_DEVICE) is one
+        assert assign_devices(several, Devices(3)) is several
 
     def test_are_as_many_as_the_design_s_sensors(self):
         request = make_request()

@@ -15,7 +15,6 @@ import numpy as np
 
 from lidardesign.errors import ConfigError
 from lidardesign.estimates import mean_interval
-from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import Progress, phase
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import path_windows
@@ -24,14 +23,15 @@ from lidardesign.scoring.accuracy import fields, training
 from lidardesign.scoring.accuracy.probes import AccuracyRequest
 from lidardesign.scoring.evaluation.request import EvaluationRequest, numbers_fired
 from lidardesign.scoring.evaluation.results import Row
-from lidardesign.scoring.scene_scores import RaysPerCondition, score_lists
+from lidardesign.scoring.fired import Positions, fired
+from lidardesign.scoring.scene_scores import score_lists
 from lidardesign.scoring.sweep import Accuracy, Measurement, Sweep, timed, with_memory
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.detector.physics import EFFECTS, Detector, Physics, check_windows
 from lidardesign.simulate.plan import EffectPlan, Planner, predicted_seconds
 from lidardesign.simulate.returns import build_casters
-from lidardesign.task import conditions_of, random_generator
+from lidardesign.task import random_generator
 
 # The detector for sweeps where the evaluation's own has no effects.
 STAND_IN = "single-photon"
@@ -92,7 +92,7 @@ class Bench:
 
     request: EvaluationRequest
     planner: Planner
-    positions: RaysPerCondition
+    positions: Positions
     scenes: Sequence[Scene]
 
     @property
@@ -125,13 +125,11 @@ class Bench:
         return np.array([self.score(number, effects, detector) for number in range(len(self.scenes))])
 
 
-def _rays(asked: EvaluationRequest, design: DesignSpec) -> tuple[int, RaysPerCondition]:
+def _rays(asked: EvaluationRequest, design: DesignSpec) -> tuple[int, Positions]:
     counts = numbers_fired(design, sorted(set(asked.rays))) or [design.count]
-    with plugin_guard(asked.task.name):
-        conditions = conditions_of(asked.task, asked.config, asked.space)
-    each = len(conditions) * asked.test[0].frames
+    each = len(asked.conditions) * asked.test[0].frames
     count = max([one for one in counts if one * each <= RAYS_PER_SCENE], default=counts[0])
-    return count, tuple(asked.fired(design, count, condition) for condition in conditions)
+    return count, fired(design, count, asked.conditions, asked.planner)
 
 
 def _paired(values: np.ndarray, reference: np.ndarray) -> tuple[float, float]:

@@ -14,9 +14,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from lidardesign.limits import MOST_RAYS
-from lidardesign.numerics import EPSILON
 from lidardesign.scenes.rays import Rays, fire_times
-from lidardesign.scoring.scene_scores import RaysPerCondition
+from lidardesign.scoring.fired import Positions
 from lidardesign.sensors.adaptive import mean_mbps
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction
@@ -72,12 +71,12 @@ class Candidate(Protocol):
     name: str
     drawn_anew: bool
 
-    def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> RaysPerCondition:
+    def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> Positions:
         """Exactly `count` rays in each of the spaces."""
 
     def positions_within(
         self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth
-    ) -> RaysPerCondition | None:
+    ) -> Positions | None:
         """As many rays as fit in a bandwidth [Mbit/s], the same number in each space; empty where not one fits.
 
         None where more than `MOST_RAYS` fit.
@@ -100,7 +99,7 @@ class BaselineLayout:
     drawn_anew: bool = False
     _known: dict[tuple[DesignSpace, int], Rays] = field(default_factory=dict, repr=False)
 
-    def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> RaysPerCondition:
+    def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> Positions:
         """See `Candidate`."""
         known = {} if self.drawn_anew else self._known
         for number, space in enumerate(spaces):
@@ -110,30 +109,22 @@ class BaselineLayout:
 
     def positions_within(
         self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth
-    ) -> RaysPerCondition | None:
+    ) -> Positions | None:
         """See `Candidate`."""
-        return most_within(lambda count: self.positions(spaces, count), limit_mbps, bandwidth, FIRST_GUESS)
+        count = most_within(lambda count: mean_mbps(self.positions(spaces, count), bandwidth), limit_mbps)
+        return None if count is None else self.positions(spaces, count)
 
 
-def most_within(
-    lay_out: Callable[[int], RaysPerCondition],
-    limit_mbps: float,
-    bandwidth: Bandwidth,
-    count: int,
-) -> RaysPerCondition | None:
-    """The most rays within a bandwidth that a few proportional steps find.
-
-    None where they are more than `MOST_RAYS`.
+def most_within(mbps_of: Callable[[int], float], limit_mbps: float) -> int | None:
+    """The most rays within a bandwidth that a few proportional steps find; None where they are more than `MOST_RAYS`.
 
     Arguments:
-        lay_out: Gives the rays of a number.
+        mbps_of: Gives the bandwidth of a number of rays [Mbit/s].
         limit_mbps: The bandwidth [Mbit/s].
-        bandwidth: The read-out model.
-        count: The number to begin with.
     """
-    low, high = 0, math.inf
+    count, low, high = FIRST_GUESS, 0, math.inf
     for _ in range(MOST_STEPS):
-        cost = mean_mbps(lay_out(count), bandwidth)
+        cost = mbps_of(count)
         low, high = (count, high) if cost <= limit_mbps else (low, count)
         if high - low <= 1 or cost == limit_mbps:
             break
@@ -141,17 +132,7 @@ def most_within(
         if guess > MOST_RAYS:
             return None
         count = int(min(max(guess, low + 1), high - 1))
-    return lay_out(low)
-
-
-def rays_within(limit_mbps: float, bandwidth: Bandwidth, gate_m: np.ndarray) -> int:
-    """The number of rays with one gate (2,) [m] that fit in a bandwidth [Mbit/s], without an upper limit."""
-    width_m = np.diff(gate_m)
-    # the ratio of two multiples of one bin may lie an ulp below a whole number
-    count = math.floor(limit_mbps / bandwidth.mbps_of_widths(width_m) * (1 + EPSILON))
-    while count and bandwidth.mbps_of_widths(width_m, count) > limit_mbps:
-        count -= 1
-    return count
+    return low
 
 
 def whole_range(space: DesignSpace) -> np.ndarray:

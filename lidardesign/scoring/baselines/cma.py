@@ -26,8 +26,8 @@ from lidardesign.numerics import SLACK, TINY, sphere_exp, sphere_log, wrap_angle
 from lidardesign.rays.gates import admitted_gates
 from lidardesign.run.clock import phase
 from lidardesign.scenes.rays import Rays
-from lidardesign.scoring.baselines.views import OutOfTimeError, TrainingObjective
-from lidardesign.scoring.scene_scores import RaysPerCondition
+from lidardesign.scoring.fired import Positions
+from lidardesign.scoring.scene_scores import TrainingScorer
 from lidardesign.sensors.adaptive import mean_mbps
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design import DesignSpec
@@ -111,7 +111,7 @@ class MovableSensors:
     `vector_bounds` are the lowest and the highest vector, shape (2, M).
     """
 
-    def __init__(self, design: DesignSpec, start: RaysPerCondition, space: DesignSpace, bandwidth: Bandwidth) -> None:
+    def __init__(self, design: DesignSpec, start: Positions, space: DesignSpace, bandwidth: Bandwidth) -> None:
         constraints = Constraints.from_mapping(design.constraints, where=f"constraints of {design.name}")
         every, z = Rays.joined(start), interval_factor(design.level)
         self.start, self.count, self._axes = start, int(every.sensor.max()) + 1, Axes.of(space)
@@ -174,7 +174,7 @@ class MovableSensors:
         unit[:, GATE.start] = GATE_SHARE * max(float(np.ptp(every.gate_m, axis=1).mean()), TINY)
         return unit
 
-    def rays(self, vector: np.ndarray) -> RaysPerCondition:
+    def rays(self, vector: np.ndarray) -> Positions:
         """The rays of a vector (M,); of the vector 0 those of the design."""
         if not vector.any():
             return self.start
@@ -202,7 +202,7 @@ class MovableSensors:
         looking = direction(azimuth, elevation)
         return replace(rays, origin_m=rays.origin_m + own[:, ORIGIN], direction=looking, gate_m=gate_m, angles_rad=None)
 
-    def excess(self, positions: RaysPerCondition) -> float:
+    def excess(self, positions: Positions) -> float:
         """The share by which the bandwidth of rays exceeds the design's; 0 where it does not."""
         return max(max(mean_mbps(positions, model) / limit - 1 - SLACK, 0.0) for model, limit in self._limits)
 
@@ -215,7 +215,7 @@ class CmaCandidate:
         design: Whose sensors are moved.
         starts: Its rays by their number.
         space: The design space at one condition value.
-        objective: The metric on training scenes.
+        scorer: Scores on training scenes.
         settings: Limits of each search.
         seed: Root of the random numbers.
         bandwidth: The read-out model.
@@ -224,41 +224,39 @@ class CmaCandidate:
     """
 
     design: DesignSpec
-    starts: Mapping[int, RaysPerCondition]
+    starts: Mapping[int, Positions]
     space: DesignSpace
-    objective: TrainingObjective
+    scorer: TrainingScorer
     settings: CmaSettings
     seed: int
     bandwidth: Bandwidth
     name: str = CMA
     drawn_anew: bool = False
-    searches: dict[int, tuple[RaysPerCondition, SearchRecord]] = field(default_factory=dict, init=False)
+    searches: dict[int, tuple[Positions, SearchRecord]] = field(default_factory=dict, init=False)
 
-    def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> RaysPerCondition:
+    def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> Positions:
         """See `lidardesign.scoring.baselines.candidates.Candidate`."""
         if count not in self.searches:
             self.searches[count] = self._searched(count)
         return self.searches[count][0]
 
-    def positions_within(
-        self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth
-    ) -> RaysPerCondition:
+    def positions_within(self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth) -> Positions:
         """See `lidardesign.scoring.baselines.candidates.Candidate`: as many rays as the design of this bandwidth."""
         of_limit = [n for n, start in self.starts.items() if mean_mbps(start, bandwidth) == limit_mbps]
         return self.positions(spaces, max(of_limit))
 
     @phase("cma")
-    def _searched(self, count: int) -> tuple[RaysPerCondition, SearchRecord]:
+    def _searched(self, count: int) -> tuple[Positions, SearchRecord]:
         # loaded here: it takes a second, and few evaluations ask for it
         import cma
 
-        began, objective, settings = time.perf_counter(), self.objective, self.settings
+        began, settings, sign = time.perf_counter(), self.settings, self.scorer.metric.sign
         generator = random_generator(self.seed, CMA, count)
         sensors = MovableSensors(self.design, self.starts[count], self.space, self.bandwidth)
         low, high = sensors.vector_bounds
         best = np.zeros(len(low))
-        value = start_value = float(objective.values([sensors.start]).mean())
-        candidates, scenes = 1, len(objective.scenes)
+        value = start_value = float(sign * self.scorer.scores([sensors.start], MOST_SCENES).mean())
+        candidates, scenes = 1, len(self.scorer.scenes(MOST_SCENES))
 
         def share() -> float:
             return max((time.perf_counter() - began) / settings.seconds, candidates * scenes / settings.evaluations)
@@ -277,9 +275,8 @@ class CmaCandidate:
                 # one that has converged begins anew at the best found so far
                 strategy = cma.CMAEvolutionStrategy(best, STEP, options)
             asked = strategy.ask()
-            try:
-                values = self._values(sensors, asked, lambda: share() >= 1.0)
-            except OutOfTimeError:
+            values = self._values(sensors, asked, lambda: share() >= 1.0)
+            if values is None:
                 break
             strategy.tell(asked, values.tolist())
             candidates += len(asked)
@@ -287,17 +284,24 @@ class CmaCandidate:
             if values[first] < value:
                 best, value = np.array(asked[first]), float(values[first])
             if settings.show is not None:
-                settings.show(f"{CMA}, {count} rays", min(share(), 1.0), objective.sign * value)
-        values = objective.sign * start_value, objective.sign * value
+                settings.show(f"{CMA}, {count} rays", min(share(), 1.0), sign * value)
+        values = sign * start_value, sign * value
         seconds = time.perf_counter() - began
         return sensors.rays(best), SearchRecord(count, sensors.count, len(best), seconds, candidates, scenes, *values)
 
-    def _values(self, sensors: MovableSensors, vectors: Sequence[np.ndarray], stop: Callable[[], bool]) -> np.ndarray:
-        """Scores of vectors, lower is better, shape (L,)."""
+    def _values(
+        self, sensors: MovableSensors, vectors: Sequence[np.ndarray], stop: Callable[[], bool]
+    ) -> np.ndarray | None:
+        """Scores of vectors, lower is better, shape (L,); None where the time is up before the last scene."""
         lists = [sensors.rays(vector) for vector in vectors]
         excess = np.array([sensors.excess(positions) for positions in lists])
-        values = self.objective.sign * self.objective.metric.worst + excess
+        metric, scores = self.scorer.metric, []
+        values = metric.sign * metric.worst + excess
         fits = np.flatnonzero(excess == 0)
-        if len(fits):
-            values[fits] = self.objective.values([lists[index] for index in fits], stop).mean(axis=0)
+        for number in range(len(self.scorer.scenes(MOST_SCENES)) if len(fits) else 0):
+            if number and stop():
+                return None
+            scores.append(self.scorer.scores_in(number, [lists[index] for index in fits]))
+        if scores:
+            values[fits] = metric.sign * np.mean(scores, axis=0)
         return values

@@ -24,11 +24,11 @@ from lidardesign.numerics import COARSE_SLACK
 from lidardesign.rays.training_scenes import CHOICE, InformedScene, TrainingScenes
 from lidardesign.run.clock import phase
 from lidardesign.scenes.rays import Rays, fire_times
-from lidardesign.scoring.baselines.candidates import rays_at, rays_within, whole_range
+from lidardesign.scoring.baselines.candidates import most_within, rays_at, whole_range
 from lidardesign.scoring.baselines.even import Crop, crop_kinds, even_placement
 from lidardesign.scoring.baselines.silhouette import LEAST_SHARE, lattice_rays, survey
 from lidardesign.scoring.baselines.views import RAY_AXES, TrainingViews
-from lidardesign.scoring.scene_scores import RaysPerCondition
+from lidardesign.scoring.fired import Positions
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.space import AZIMUTH, DesignSpace
 from lidardesign.task import Task
@@ -97,28 +97,26 @@ class GreedyCandidate:
     fired: Sequence[Fired]
     bandwidth: Bandwidth
 
-    def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> RaysPerCondition:
+    def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> Positions:
         """See `Candidate`; in no more than the largest bandwidth of a design with so many rays."""
         limits = [one.mbps for one in self.fired if one.rays == count] if self.gates_per_ray else []
         return self._chosen(count, max(limits, default=np.inf))
 
-    def positions_within(
-        self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth
-    ) -> RaysPerCondition:
+    def positions_within(self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth) -> Positions:
         """As many rays as the design of this bandwidth fires; with one gate as many as fit."""
         if self.gates_per_ray:
             return self._chosen(max(one.rays for one in self.fired if one.mbps == limit_mbps), limit_mbps)
-        gates_m = np.concatenate([rays.gate_m[:1] for rays in self._proposed])
-        fit = rays_within(limit_mbps * len(gates_m), bandwidth, gates_m)
-        most = min(MOST_CHOSEN // len(gates_m), *(len(rays) for rays in self._proposed))
-        return self._chosen(min(fit, most), np.inf)
+        widths_m = np.concatenate([np.diff(rays.gate_m[:1]) for rays in self._proposed])
+        fit = most_within(partial(bandwidth.mbps_of_widths, widths_m), limit_mbps * len(widths_m))
+        most = min(MOST_CHOSEN // len(widths_m), *(len(rays) for rays in self._proposed))
+        return self._chosen(most if fit is None else min(fit, most), np.inf)
 
     @cached_property
-    def _chosen(self) -> Callable[[int, float], RaysPerCondition]:
+    def _chosen(self) -> Callable[[int, float], Positions]:
         """`_choice`, which is made once."""
         return cache(self._choice)
 
-    def _choice(self, count: int, limit_mbps: float) -> RaysPerCondition:
+    def _choice(self, count: int, limit_mbps: float) -> Positions:
         """The choice of `count` rays at each value, within a bandwidth that is a mean over the values [Mbit/s]."""
         from lidardesign.rays.choice import choose, choose_within
 

@@ -40,13 +40,13 @@ from lidardesign.scoring.baselines.even import bounding, central_interval, even_
 from lidardesign.scoring.baselines.greedy import GREEDY, Fired
 from lidardesign.scoring.baselines.silhouette import lloyd, silhouette
 from lidardesign.scoring.baselines.views import RAY_AXES, TrainingViews, spread_frames
-from lidardesign.scoring.scene_scores import RaysPerCondition
+from lidardesign.scoring.fired import Positions, fired
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, aim, observed_point
 from lidardesign.task import random_generator
 
-Judge = Callable[[Sequence[RaysPerCondition]], Sequence[float]]
+Judge = Callable[[Sequence[Positions]], Sequence[float]]
 NO_VISIBILITY = "no-visibility"
 # In the place of names: no baselines at all.
 NONE = "none"
@@ -69,7 +69,7 @@ class Option(NamedTuple):
     """A candidate at a number of rays."""
 
     candidate: Candidate
-    positions: RaysPerCondition
+    positions: Positions
 
 
 class Baselines:
@@ -250,13 +250,11 @@ class TwinCandidate:
     ) -> None:
         self._fit, self._conditions, self._fired = fit, conditions, fired
 
-    def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> RaysPerCondition:
+    def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> Positions:
         """See `lidardesign.scoring.baselines.candidates.Candidate`."""
         return self._rays(count, None)
 
-    def positions_within(
-        self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth
-    ) -> RaysPerCondition:
+    def positions_within(self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth) -> Positions:
         """As many rays as the design of this bandwidth fires, or fewer where its own gates need more for so many."""
         count = max(one.rays for one in self._fired if one.mbps == limit_mbps)
         while True:
@@ -267,9 +265,8 @@ class TwinCandidate:
                     raise
                 count = math.floor(FEWER_RAYS * count)
 
-    def _rays(self, count: int, limit_mbps: float | None) -> RaysPerCondition:
-        design = self._fit(count, limit_mbps)
-        return tuple(design.rays(count, at=at or None) for at in self._conditions)
+    def _rays(self, count: int, limit_mbps: float | None) -> Positions:
+        return fired(self._fit(count, limit_mbps), count, self._conditions)
 
 
 def occupancy(space: DesignSpace, train: Sequence[Scene], seed: int) -> BaselineLayout | None:

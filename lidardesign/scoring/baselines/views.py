@@ -1,9 +1,8 @@
-"""Training scenes as baselines see them: their returns, the gates that hold these, and the task's metric."""
+"""Training scenes as baselines see them: their returns, and the gates that hold these."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from functools import cache, cached_property
 
 import numpy as np
@@ -13,13 +12,8 @@ from lidardesign.numerics import wrap_turn
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.scene import Scene
 from lidardesign.scoring.baselines.candidates import opened_gate, whole_range
-from lidardesign.scoring.scene_scores import RaysPerCondition, score_lists
 from lidardesign.sensors.pattern import low_discrepancy
-from lidardesign.simulate.detector.physics import Physics
-from lidardesign.simulate.plan import Planner
-from lidardesign.simulate.returns import build_casters
 from lidardesign.space import AZIMUTH, ELEVATION, FULL_TURN, RANGE, DesignSpace, direction
-from lidardesign.task import Metric, Task
 
 RAY_AXES = 5  # x, y, z, azimuth, elevation: everything but the range
 
@@ -194,55 +188,3 @@ def unrolled(azimuth_rad: np.ndarray) -> np.ndarray:
     turned = np.sort(wrap_turn(azimuth_rad))
     gaps = np.diff(np.append(turned, turned[0] + FULL_TURN))
     return wrap_turn(azimuth_rad, turned[(int(np.argmax(gaps)) + 1) % len(turned)])
-
-
-class OutOfTimeError(Exception):
-    """The time was up before all was scored."""
-
-
-@dataclass(frozen=True, eq=False)
-class TrainingObjective:
-    """The task's metric on training scenes, turned so that lower is better.
-
-    Arguments:
-        task: The task that scores.
-        metric: Its metric.
-        scenes: Training scenes.
-        planner: The detector, and how effects are chosen.
-        seed: Root of the effects' random streams.
-    """
-
-    task: Task
-    metric: Metric
-    scenes: Sequence[Scene]
-    planner: Planner
-    seed: int
-    _prepared: dict[int, tuple[list[SceneCaster], Physics | None]] = field(default_factory=dict, repr=False)
-
-    @property
-    def sign(self) -> float:
-        """1 where lower is better, else -1."""
-        return 1.0 if self.metric.better == "lower" else -1.0
-
-    def values(self, lists: Sequence[RaysPerCondition], stop: Callable[[], bool] = lambda: False) -> np.ndarray:
-        """The score of every set of rays in every scene, lower is better, shape (scenes, sets).
-
-        Arguments:
-            lists: The sets of rays; one without rays has the metric's worst value everywhere.
-            stop: Asked before every scene but the first whether the time is up.
-
-        Raises:
-            OutOfTimeError: It was.
-        """
-        found = np.empty((len(self.scenes), len(lists)))
-        for number, scene in enumerate(self.scenes):
-            if number and stop():
-                raise OutOfTimeError
-            if number not in self._prepared:
-                # the rays that are fired first say which effects a scene calls for
-                casters = build_casters(scene)
-                plan = self.planner.plan(scene, [rays for positions in lists for rays in positions], casters)
-                self._prepared[number] = casters, self.planner.physics(plan, self.seed)
-            scores = score_lists(self.task, self.metric, scene, lists, *self._prepared[number])
-            found[number] = [self.sign * score.value for score, _ in scores]
-        return found

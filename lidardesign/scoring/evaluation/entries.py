@@ -6,7 +6,6 @@ effects of all rows, with their reasons, are summed up over scenes.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -14,24 +13,21 @@ from typing import Any
 
 import numpy as np
 
-from lidardesign.errors import ConfigError
 from lidardesign.rays.proposals import CANDIDATES_PER_RAY
 from lidardesign.rays.training_scenes import HELD_BACK
-from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.scoring.baselines import cma
 from lidardesign.scoring.baselines.candidates import Candidate
 from lidardesign.scoring.baselines.greedy import GREEDY, USUAL_SCENES, Fired, GreedyCandidate, greedy_rays
 from lidardesign.scoring.baselines.simple import Baselines, Option, TwinCandidate
-from lidardesign.scoring.baselines.views import TrainingObjective, TrainingViews
+from lidardesign.scoring.baselines.views import TrainingViews
 from lidardesign.scoring.evaluation.request import EvaluationRequest, fired_numbers, numbers_fired
-from lidardesign.scoring.scene_scores import ONE_DEVICE, Devices, RaysPerCondition, score_scenes
+from lidardesign.scoring.fired import ONE_DEVICE, Devices, Positions, assign_devices, fired
 from lidardesign.sensors.adaptive import AdaptiveRays, mean_mbps
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.simulate.detector.physics import EFFECTS
 from lidardesign.simulate.plan import Choice, EffectPlan, Tolerance
-from lidardesign.task import conditions_of
 
 # Candidates of a baseline are compared on this many training scenes: enough to tell a good layout from a bad one,
 # at a fraction of the held-out scenes' cost.
@@ -60,9 +56,9 @@ class Entry:
     """
 
     name: str
-    positions: RaysPerCondition
+    positions: Positions
     baseline: bool
-    redraw: Callable[[int], RaysPerCondition] | None = None
+    redraw: Callable[[int], Positions] | None = None
     matched_to: str | None = None
     matched_rays: int | None = None
     search: cma.SearchRecord | None = None
@@ -82,13 +78,13 @@ class Entry:
         """The bandwidth of its rays, averaged over condition values [Mbit/s]."""
         return mean_mbps(self.positions, bandwidth)
 
-    def rays_in(self, scene: int) -> RaysPerCondition:
+    def rays_in(self, scene: int) -> Positions:
         """The rays that it fires in a held-out scene."""
         return self.positions if self.redraw is None else self.redraw(scene)
 
-    def lit_in(self, scene: int) -> RaysPerCondition:
+    def lit_in(self, scene: int) -> Positions:
         """The rays that it fires in a held-out scene, each with its device's light."""
-        return self.devices.firing(self.rays_in(scene))
+        return assign_devices(self.rays_in(scene), self.devices)
 
     @cached_property
     def key(self) -> tuple[Any, ...]:
@@ -106,35 +102,33 @@ def entries_of(request: EvaluationRequest) -> list[Entry]:
     Raises:
         ConfigError: No design can fire any of the numbers of rays, or its rays end before where it is evaluated.
     """
-    conditions = _conditions(request)
-    _check_ends(request, conditions)
     counts = fired_numbers(request.designs, request.rays)
     designs = [
         entry
         for design in request.designs
         for count in numbers_fired(design, counts, request.alone)
-        for entry in _of_design(request, conditions, design, count)
+        for entry in _of_design(request, design, count)
     ]
     shared = [count for count in counts if count not in request.alone]
-    choosable = [] if request.training is None else greedy_rays(request.task, len(conditions), shared)[0]
+    choosable = [] if request.training is None else greedy_rays(request.task, len(request.conditions), shared)[0]
     # a search starts from single patterns of the first design
     named = (request.designs[0].name, f"{request.designs[0].name}{SINGLE}") if request.designs else ()
     searched = [one for one in designs if one.name in named and not isinstance(one.positions, AdaptiveRays)]
     starts = {one.rays: one.positions for one in searched}
     # beside several designs a baseline has as many devices as the one with the most
     devices = max((Devices.of(one.positions) for one in designs), key=lambda one: one.number, default=ONE_DEVICE)
-    fired = [Fired(entry.rays, entry.mbps(request.bandwidth)) for entry in designs]
+    compared = [Fired(entry.rays, entry.mbps(request.bandwidth)) for entry in designs]
     refit = request.without_visibility
     baselines = Baselines(
         request.space,
         request.train,
         request.seed,
         partial(_judge, request, devices),
-        conditions=conditions,
+        conditions=request.conditions,
         gates_per_ray=any(design.has_gates_per_ray for design in request.designs),
-        without_visibility=refit and partial(TwinCandidate, refit, conditions, fired),
-        optimised=partial(_optimised, request, conditions, starts) if request.designs else None,
-        chosen=partial(_chosen, request, conditions, fired, max(choosable, default=0)),
+        without_visibility=refit and partial(TwinCandidate, refit, request.conditions, compared),
+        optimised=partial(_optimised, request, starts) if request.designs else None,
+        chosen=partial(_chosen, request, compared, max(choosable, default=0)),
     )
     wanted: list[tuple[str, list[Option], Entry | None]] = [
         (name, baselines.options(name, count), None)
@@ -160,21 +154,6 @@ def entries_of(request: EvaluationRequest) -> list[Entry]:
     ]
 
 
-def _check_ends(request: EvaluationRequest, conditions: Sequence[Mapping[str, float]]) -> None:
-    for design in request.designs:
-        name = design.condition
-        if name is None:
-            continue
-        first, last = design.patterns[-1].ends
-        beyond = [one[name] for one in conditions if name in one and not first <= one[name] <= last]
-        if beyond:
-            raise ConfigError(
-                f"its rays go from {name}={first:g} to {last:g}, but designs are evaluated at {beyond[0]:g} too",
-                where=f"design {design.name}",
-                hint="fit a design of the whole way: lidardesign fit RUN",
-            )
-
-
 def _entry(baselines: Baselines, name: str, option: Option, matched: Entry | None, devices: Devices) -> Entry:
     candidate, count = option.candidate, len(option.positions[0])
     searched = matched is None and isinstance(candidate, cma.CmaCandidate)
@@ -190,74 +169,49 @@ def _entry(baselines: Baselines, name: str, option: Option, matched: Entry | Non
     )
 
 
-def _conditions(request: EvaluationRequest) -> list[dict[str, float]]:
-    with plugin_guard(request.task.name):
-        return conditions_of(request.task, request.config, request.space)
-
-
-def ordered_conditions(request: EvaluationRequest) -> list[dict[str, float]]:
-    """The condition values that are evaluated at, ascending; one empty entry without conditions."""
-    return sorted(_conditions(request), key=lambda condition: tuple(condition.values()))
-
-
-def _of_design(
-    request: EvaluationRequest, conditions: Sequence[Mapping[str, float]], design: DesignSpec, count: int
-) -> list[Entry]:
+def _of_design(request: EvaluationRequest, design: DesignSpec, count: int) -> list[Entry]:
     """The entry of a design; where its patterns follow what they see, with the best single one beside it."""
-    positions = tuple(request.fired(design, count, condition) for condition in conditions)
-    fixed = Entry(design.name, positions, baseline=False)
-    adaptive = design.following(count)
-    if adaptive is None:
+    rays_of = partial(fired, design, count, request.conditions, request.planner)
+    fixed = Entry(design.name, rays_of(), baseline=False)
+    if design.following(count) is None:
         return [fixed]
-    return [
-        replace(fixed, positions=request.following(design, adaptive)),
-        replace(fixed, name=f"{design.name}{SINGLE}"),
-    ]
+    return [replace(fixed, positions=rays_of(request.task)), replace(fixed, name=f"{design.name}{SINGLE}")]
 
 
-def _optimised(
-    request: EvaluationRequest, conditions: Sequence[Mapping[str, float]], starts: Mapping[int, RaysPerCondition]
-) -> Candidate:
-    design, space, scenes = request.designs[0], request.space, request.train[: cma.MOST_SCENES]
+def _optimised(request: EvaluationRequest, starts: Mapping[int, Positions]) -> Candidate:
+    design, space, conditions = request.designs[0], request.space, request.conditions
     middle = conditions[len(conditions) // 2]
     return cma.CmaCandidate(
         design=design,
         starts=starts,
         space=space.at({**middle, **design.at}) if space.conditioned else space,
-        objective=TrainingObjective(request.task, request.metric, scenes, request.planner, request.seed),
+        scorer=request.scorer(request.train, keeps_casters=True),
         settings=request.cma,
         seed=request.seed,
         bandwidth=request.bandwidth,
     )
 
 
-def _chosen(
-    request: EvaluationRequest,
-    conditions: Sequence[Mapping[str, float]],
-    fired: Sequence[Fired],
-    most: int,
-    views: TrainingViews,
-) -> Candidate:
+def _chosen(request: EvaluationRequest, compared: Sequence[Fired], most: int, views: TrainingViews) -> Candidate:
     numbers = [one["scenes"] for design in request.designs for one in design.certificates]
     return GreedyCandidate(
         views=views,
-        spaces=[request.space.at(condition) for condition in conditions],
+        spaces=[request.space.at(condition) for condition in request.conditions],
         training=request.training,
         scenes=max(numbers, default=USUAL_SCENES),
         gates_per_ray=any(design.has_gates_per_ray for design in request.designs),
         candidates=CANDIDATES_PER_RAY * most,
-        fired=fired,
+        fired=compared,
         bandwidth=request.bandwidth,
     )
 
 
-def _judge(request: EvaluationRequest, devices: Devices, lists: Sequence[RaysPerCondition]) -> list[float]:
+def _judge(request: EvaluationRequest, devices: Devices, lists: Sequence[Positions]) -> list[float]:
     """The mean score of sets of rays on a few training scenes, turned so that lower is better."""
-    scenes = request.train[:JUDGED_SCENES]
-    objective = TrainingObjective(request.task, request.metric, scenes, request.planner, request.seed)
-    if not objective.scenes:
+    if not request.train:
         return [0.0] * len(lists)
-    return objective.values(list(map(devices.firing, lists))).mean(axis=0).tolist()
+    assigned = [assign_devices(positions, devices) for positions in lists]
+    return (request.metric.sign * request.scorer(request.train).scores(assigned, JUDGED_SCENES).mean(axis=0)).tolist()
 
 
 @phase("strongest baseline")
@@ -272,23 +226,17 @@ def strongest_baseline(request: EvaluationRequest, entries: Sequence[Entry], ray
     baselines = [entry for entry in entries if entry.baseline and entry.matched_to is None and entry.rays == rays]
     if not baselines or not request.train:
         return None
-    fired = sum(entry.rays for entry in entries) * len(request.test)
-    affordable = int(LARGEST_BASELINE_SHARE * fired / (rays * len(baselines)))
+    in_all = sum(entry.rays for entry in entries) * len(request.test)
+    affordable = int(LARGEST_BASELINE_SHARE * in_all / (rays * len(baselines)))
     # the first ones where a request has no others
     held_back = request.train if request.training is None else request.training.scenes(HELD_BACK)
     count = min(max(affordable, FEWEST_BASELINE_SCENES), MOST_BASELINE_SCENES)
-    scenes = list(itertools.islice(held_back, count))
-    found = score_scenes(
-        request.task,
-        request.metric,
-        request.seed,
-        scenes,
-        lambda number: [entry.lit_in(number) for entry in baselines],
-        request.planner,
-    )
-    means = np.mean([[score.value for score, _ in scene.scores] for scene in found], axis=0).tolist()
+    scorer = request.scorer(held_back)
+    numbers = range(len(scorer.scenes(count)))
+    scores = [scorer.scores_in(number, [entry.lit_in(number) for entry in baselines]) for number in numbers]
+    means = np.mean(scores, axis=0).tolist()
     values = dict(zip((entry.name for entry in baselines), means, strict=True))
-    return StrongestBaseline.best_of(values, request.metric.better, rays, len(scenes))
+    return StrongestBaseline.best_of(values, request.metric.better, rays, len(numbers))
 
 
 @dataclass(frozen=True)

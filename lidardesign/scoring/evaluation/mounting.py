@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from lidardesign.errors import ConfigError
 from lidardesign.run.yaml import plain_number
 from lidardesign.scenes.rays import Rays
-from lidardesign.scoring.scene_scores import RaysPerCondition
+from lidardesign.scoring.fired import Positions
 from lidardesign.sensors.adaptive import mapped
 from lidardesign.task import random_generator
 
@@ -66,7 +66,7 @@ class MountError:
     def __str__(self) -> str:
         return f"{1e3 * self.place_m:.3g} mm and {math.degrees(self.angle_rad):.3g} degrees"
 
-    def misplaced(self, positions: RaysPerCondition, seed: int, scene: int) -> RaysPerCondition:
+    def misplaced(self, positions: Positions, seed: int, scene: int) -> Positions:
         """The rays of sensors with the mounting errors of a scene, at every position."""
         sensors = max((int(rays.sensor.max(initial=-1)) for rays in positions), default=-1) + 1
         draws = random_generator(seed, "mounting", scene).normal(size=(sensors, 6))

@@ -7,28 +7,25 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
 from lidardesign.errors import ConfigError, PluginError
-from lidardesign.rays.information import features_of
 from lidardesign.rays.training_scenes import TrainingScenes
 from lidardesign.registry import plugin_guard
 from lidardesign.samples import Samples
-from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Scene
 from lidardesign.scoring.baselines.cma import CmaSettings
 from lidardesign.scoring.baselines.simple import ALWAYS, BASELINES, check_baseline
 from lidardesign.scoring.evaluation.mounting import MountError
-from lidardesign.sensors.adaptive import AdaptivePatterns, AdaptiveRays, mapped
+from lidardesign.scoring.scene_scores import TrainingScorer
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design import DesignSpec
-from lidardesign.simulate.calibration import with_part_light
 from lidardesign.simulate.plan import Planner
 from lidardesign.space import DesignSpace
-from lidardesign.task import Metric, Task, metric_of, mount_of
+from lidardesign.task import Metric, Task, conditions_of, metric_of, mount_of
 from lidardesign.workers import Starmap
 
 # Fixed patterns of more rays are scored without baselines, unless their number is asked for: some have 100,000.
@@ -95,8 +92,14 @@ class EvaluationRequest:
         with plugin_guard(self.task.name):
             return metric_of(self.task, self.config)
 
+    @cached_property
+    def conditions(self) -> list[dict[str, float]]:
+        """The condition values that are evaluated at; one empty entry without conditions."""
+        with plugin_guard(self.task.name):
+            return conditions_of(self.task, self.config, self.space)
+
     @property
-    def losing(self) -> dict[str, int]:
+    def sensors_to_lose(self) -> dict[str, int]:
         """The numbers of sensors of designs that are scored with each of them lost, by the designs' names."""
         own = [design for design in self.designs if self.losses or design.constraints.get("survive")]
         return {design.name: len(design.sensors) for design in own}
@@ -128,14 +131,9 @@ class EvaluationRequest:
         if any(count < 1 for count in self.rays):
             raise ConfigError(f"{min(self.rays)} rays", where="--rays", allowed="1 or more")
 
-    def fired(self, design: DesignSpec, count: int, at: Mapping[str, float]) -> Rays:
-        """The rays of a design at condition values, with the light that the detector has in its parts."""
-        return with_part_light(design.rays(count, at=at or None), design, self.planner.detector)
-
-    def following(self, design: DesignSpec, adaptive: AdaptivePatterns) -> AdaptiveRays:
-        """The rays of a design's patterns that follow what they see, with the detector's light."""
-        rays = adaptive.rays(features_of(self.task))
-        return mapped(rays, lambda one: with_part_light(one, design, self.planner.detector))
+    def scorer(self, scenes: Iterable[Scene], *, keeps_casters: bool = False) -> TrainingScorer:
+        """A scorer of training scenes, under the effects of the evaluation."""
+        return TrainingScorer(self.task, self.metric, self.seed, scenes, self.planner, keeps_casters=keeps_casters)
 
 
 def numbers_fired(design: DesignSpec, asked: Iterable[int], alone: Sequence[int] = ()) -> list[int]:
@@ -151,7 +149,7 @@ def numbers_fired(design: DesignSpec, asked: Iterable[int], alone: Sequence[int]
     return [count for count in asked if count not in alone and (size is None or count <= size)]
 
 
-def numbers_alone(counts: Iterable[int], budgets: Iterable[int]) -> list[int]:
+def counts_without_baselines(counts: Iterable[int], budgets: Iterable[int]) -> list[int]:
     """The usual numbers of rays above the task's and `MOST_SHARED`, for which baselines would take minutes."""
     return [count for count in counts if count > max(MOST_SHARED, *budgets)]
 
@@ -188,7 +186,7 @@ def fired_numbers(designs: Sequence[DesignSpec], counts: Iterable[int]) -> list[
     return kept
 
 
-def left_out(designs: Sequence[DesignSpec], counts: Iterable[int], alone: Sequence[int] = ()) -> list[str]:
+def missing_row_notes(designs: Sequence[DesignSpec], counts: Iterable[int], alone: Sequence[int] = ()) -> list[str]:
     """Lines for people on numbers of rays at which designs have no row."""
     asked = sorted(set(counts))
     lines = []

@@ -315,8 +315,7 @@ def verdict(evaluation: Evaluation, pair: Paired) -> str:
     """`better` or `worse` where the paired interval of a excludes zero, `open` where it does not or there is none."""
     if pair.ci_low is None or pair.ci_high is None:
         return "open"
-    sign = 1.0 if evaluation.metric.better == "lower" else -1.0
-    low, high = sorted((sign * pair.ci_low, sign * pair.ci_high))
+    low, high = sorted(evaluation.metric.sign * end for end in (pair.ci_low, pair.ci_high))
     return "better" if high < 0 else "worse" if low > 0 else "open"
 
 

@@ -36,9 +36,10 @@ from lidardesign.scoring.baselines.cma import CMA
 from lidardesign.scoring.baselines.greedy import GREEDY, greedy_rays
 from lidardesign.scoring.evaluation.entries import Entry, effect_notes, effect_summaries, entries_of, strongest_baseline
 from lidardesign.scoring.evaluation.mounting import MountError
-from lidardesign.scoring.evaluation.request import EvaluationRequest, left_out
+from lidardesign.scoring.evaluation.request import EvaluationRequest, missing_row_notes
 from lidardesign.scoring.evaluation.results import Audit, Evaluation, Mounting, Paired, Row, audit_rows, middle_rays
-from lidardesign.scoring.scene_scores import RaysPerCondition, score_scenes, silent_notes, without_each
+from lidardesign.scoring.fired import Positions, without_each
+from lidardesign.scoring.scene_scores import score_scenes, silent_notes
 from lidardesign.sensors.adaptive import AdaptiveRays
 from lidardesign.sensors.compare import outside_notes
 from lidardesign.sensors.design_file import design_document
@@ -74,9 +75,13 @@ def evaluate(request: EvaluationRequest, progress: Progress | None = None) -> Ev
     """
     request.check()
     entries = entries_of(request)
-    passes = 1 + request.audit + bool(request.losing) + (request.mount_error is not None)
+    passes = 1 + request.audit + bool(request.sensors_to_lose) + (request.mount_error is not None)
     scored = _score_all(request, entries, request.planner, progress_of_part(progress, 0, passes))
-    losses = _losses(request, entries, scored.plans, progress_of_part(progress, 1, passes)) if request.losing else {}
+    losses = (
+        _losses(request, entries, scored.plans, progress_of_part(progress, 1, passes))
+        if request.sensors_to_lose
+        else {}
+    )
     rows = [replace(row, lost=losses.get(n, ())) for n, row in enumerate(_rows(request, entries, scored))]
     effects = effect_summaries(scored.plans)
     audit = (
@@ -147,11 +152,12 @@ def _losses(
     request: EvaluationRequest, entries: Sequence[Entry], plans: Sequence[EffectPlan], progress: Progress | None
 ) -> dict[int, tuple[float, ...]]:
     """The mean score of entries without each of their sensors, by the entry's number, under the same effects."""
+    sensors = request.sensors_to_lose
     lost = {
         (number, sensor): replace(entry, name=f"{entry.name}/{sensor}", positions=left)
         for number, entry in enumerate(entries)
-        if not entry.baseline and entry.name in request.losing and not isinstance(entry.positions, AdaptiveRays)
-        for sensor, left in enumerate(without_each(entry.positions, request.losing[entry.name]))
+        if not entry.baseline and entry.name in sensors and not isinstance(entry.positions, AdaptiveRays)
+        for sensor, left in enumerate(without_each(entry.positions, sensors[entry.name]))
     }
     scored = _score_all(request, list(lost.values()), request.planner, progress, plans)
     means = [
@@ -182,7 +188,7 @@ def _mounting(
     return Mounting(error, found, [_pair(row, own, request.metric) for row, own in zip(found, exact, strict=True)])
 
 
-def _misplaced(error: MountError, entry: Entry, seed: int, scene: int) -> RaysPerCondition:
+def _misplaced(error: MountError, entry: Entry, seed: int, scene: int) -> Positions:
     return error.misplaced(entry.rays_in(scene), seed, scene)
 
 
@@ -276,7 +282,7 @@ def _bandwidth_pairs(rows: Sequence[Row], matched: Sequence[Row], metric: Metric
 
 def _notes(request: EvaluationRequest, entries: Sequence[Entry], matched: Sequence[Row]) -> list[str]:
     positions = max(len(entry.positions) for entry in entries if not isinstance(entry.positions, AdaptiveRays))
-    notes = left_out(request.designs, request.rays, request.alone)
+    notes = missing_row_notes(request.designs, request.rays, request.alone)
     if positions > 1:
         counted = f"rays and bandwidth are per position; every scene is seen from {positions} positions"
         notes.append(BackgroundNote(counted))
