@@ -54,9 +54,9 @@ def add_rows(
     figures: Figures, scan: Path, designs: Sequence[Any], estimator: str, folder: Path, gate: str | None = None
 ) -> None:
     """Outliers [%] and Chamfer [mm] of designs in a capture."""
-    from lidardesign.scoring.captures.capture import load_capture
-    from lidardesign.scoring.captures.scan import Estimation, default_within_rad
-    from lidardesign.scoring.captures.score import CaptureSettings, evaluate_capture
+    from lidardesign.evaluation.captures.capture import load_capture
+    from lidardesign.evaluation.captures.scan import Estimation, default_within_rad
+    from lidardesign.evaluation.captures.score import CaptureSettings, evaluate_capture
 
     capture = load_capture(scan)
     settings = CaptureSettings(

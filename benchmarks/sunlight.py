@@ -33,7 +33,7 @@ class Tally:
 
 def request_of(run: Any, designs: list[Any], options: Any) -> Any:
     """What to evaluate, with the detector and what the scenes call for."""
-    from lidardesign.scoring.evaluation.request import EvaluationRequest
+    from lidardesign.evaluation.request import EvaluationRequest
     from lidardesign.simulate.detector.files import load_detector
     from lidardesign.simulate.plan import Planner
 
@@ -148,7 +148,7 @@ def main() -> None:
 def measure(run_folder: Path, options: Any) -> None:
     """Fit, simulate and print."""
     from lidardesign import open_run
-    from lidardesign.scoring.evaluation.entries import entries_of
+    from lidardesign.evaluation.entries import entries_of
 
     run = open_run(run_folder)
     designs = [fitted(run_folder, f"sunlight-{n}", sensors=n, layout="even").specification for n in options.sensors]

@@ -78,8 +78,8 @@ def verdicts(found: dict[str, Any]) -> list[str]:
 def miss_rates(run_folder: Path, designs: list[Any], x_m: float, rays: int) -> dict[str, float]:
     """Mean miss rate [%] on the held-out shelves seen from one position, by design and baseline."""
     from lidardesign import open_run
-    from lidardesign.scoring.evaluation.request import EvaluationRequest
-    from lidardesign.scoring.evaluation.score import evaluate
+    from lidardesign.evaluation.request import EvaluationRequest
+    from lidardesign.evaluation.score import evaluate
     from lidardesign.task import scenes_of
 
     run = open_run(run_folder)

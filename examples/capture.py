@@ -30,7 +30,7 @@ from lidardesign.run.files import write_atomic
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Mesh, Scene
-from lidardesign.scoring.captures.capture import Capture, load_capture
+from lidardesign.evaluation.captures.capture import Capture, load_capture
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.detector.physics import FWHM_PER_SIGMA, Detector, Physics
 from lidardesign.simulate.returns import photon_histograms

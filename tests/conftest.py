@@ -56,7 +56,7 @@ def pytest_terminal_summary(terminalreporter):
 SMALL = {
     "FEW_SCENES": (5, "rays.information rays.training_scenes rays.selection fitting.chosen fitting.trials"),
     "MOST_SCENES": (10, "rays.information rays.selection fitting.trials"),
-    "USUAL_SCENES": (10, "scoring.evaluation.entries"),
+    "USUAL_SCENES": (10, "evaluation.entries"),
     "COUNTS": ((1, 2), "fitting.fit"),
 }
 

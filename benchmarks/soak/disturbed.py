@@ -35,7 +35,7 @@ LATE = (
     "lidardesign.density.fields.table_kernels", "lidardesign.density.training.learn",
     "lidardesign.density.spline_kernels", "lidardesign.mixture.support", "lidardesign.mixture.fit",
     "lidardesign.fitting.chosen", "lidardesign.rays.pool", "lidardesign.scoring.metrics", "lidardesign.report.page",
-    "lidardesign.scoring.evaluation.score", "lidardesign.scoring.evaluation.results", "lidardesign.workers",
+    "lidardesign.evaluation.score", "lidardesign.evaluation.results", "lidardesign.workers",
     "lidardesign.api.export", "lidardesign.clouds.files", "lidardesign.contract.scaffold",
     "lidardesign.formats.ray_tracers", "lidardesign_tasks.flatland", "plotly.io", "rich.table", "torch._dynamo",
 )  # fmt: skip

@@ -116,7 +116,7 @@ read_mesh = _own("lidardesign.scenes.mesh_files:load_mesh", lambda mesh: (mesh, 
 read_face = _own("lidardesign_tasks.basel:load_model", lambda model: (model, model.shape(model.modes[:, 0, 0] * 0)))
 # true ranges may be NaN where nothing is
 read_capture = _own(
-    "lidardesign.scoring.captures.capture:load_capture",
+    "lidardesign.evaluation.captures.capture:load_capture",
     lambda one: (replace(one, true_range_m=None), one.spacing_rad, one.background_per_bin),
 )
 read_model = _own("lidardesign.scenes.mujoco_models:load_model", lambda found: (found[0].nq, list(found[1])))

@@ -191,7 +191,7 @@ class Run(RunFolder):
         from lidardesign.api.scores import evaluation_request
         from lidardesign.formats.rig import Rig, RigSensor, rig_design
         from lidardesign.scoring.baselines.simple import check_baseline
-        from lidardesign.scoring.evaluation.entries import entries_of
+        from lidardesign.evaluation.entries import entries_of
 
         check_baseline(baseline)
         name = name or f"{baseline}-rays"
@@ -283,7 +283,7 @@ def _figure(learned: Mapping[str, Any] | None, name: str) -> float | None:
 
 def _design_entry(path: Path, manifest: Mapping[str, Any]) -> dict[str, Any]:
     """A design of a run and its last score; one that cannot be read says why."""
-    from lidardesign.scoring.evaluation.last_scores import last_score
+    from lidardesign.evaluation.last_scores import last_score
 
     entry: dict[str, Any] = {"name": path.stem, "path": str(path), "score": None}
     try:

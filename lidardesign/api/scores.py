@@ -22,21 +22,21 @@ from lidardesign.rays.training_scenes import TrainingScenes
 from lidardesign.run.clock import Progress, outermost_clock, phase, running
 from lidardesign.run_folder import DESIGN_FOLDER, SAMPLES, Notes, RunFolder, log_note, settings_texts
 from lidardesign.samples import load_samples
-from lidardesign.scoring.baselines.cma import CMA, DEFAULT_SECONDS, CmaSettings
+from lidardesign.methods.cma import CMA, DEFAULT_SECONDS, CmaSettings
 from lidardesign.scoring.baselines.simple import ALWAYS, BASELINES, NONE, check_baseline
-from lidardesign.scoring.evaluation.headline import check_audit, check_better, check_limit
-from lidardesign.scoring.evaluation.last_scores import SCORES, last_scores_of
-from lidardesign.scoring.evaluation.mounting import MountError
-from lidardesign.scoring.evaluation.request import EvaluationRequest, counts_without_baselines, usual_numbers
-from lidardesign.scoring.evaluation.results import Evaluation, Paired, Row, write_csv
-from lidardesign.scoring.evaluation.score import evaluate as score_designs
+from lidardesign.evaluation.headline import check_audit, check_better, check_limit
+from lidardesign.evaluation.last_scores import SCORES, last_scores_of
+from lidardesign.evaluation.mounting import MountError
+from lidardesign.evaluation.request import EvaluationRequest, counts_without_baselines, usual_numbers
+from lidardesign.evaluation.results import Evaluation, Paired, Row, write_csv
+from lidardesign.evaluation.score import evaluate as score_designs
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.plan import Planner, Tolerance, parse_effects
 from lidardesign.workers import check_workers, opened_workers
 
 if TYPE_CHECKING:
     from lidardesign.report.figures import Figure
-    from lidardesign.scoring.baselines.cma import Show
+    from lidardesign.methods.cma import Show
 
 MILLIMETRES = 1000.0
 COMMAND = "evaluate"
@@ -301,8 +301,8 @@ class Scores:
         if (request.config, request.seed) != (run.config.task, run.config.seed):
             request = replace(request, train=run.scenes("train", run.config.seed))
         with phase("accuracy"):
-            from lidardesign.scoring.accuracy.evaluation import measure_accuracy
-            from lidardesign.scoring.accuracy.probes import AccuracyRequest
+            from lidardesign.evaluation.accuracy.evaluation import measure_accuracy
+            from lidardesign.evaluation.accuracy.probes import AccuracyRequest
 
             accuracy = measure_accuracy(
                 AccuracyRequest(run.config, run.folder, request, self.evaluation), progress=progress

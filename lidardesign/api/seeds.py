@@ -21,12 +21,12 @@ from lidardesign.errors import ConfigError, DataError, pasted
 from lidardesign.formats.designs import read_design
 from lidardesign.run.clock import Progress, outermost_clock, running
 from lidardesign.run_folder import Notes, RunFolder, log_note
-from lidardesign.scoring.evaluation.request import usual_numbers
-from lidardesign.scoring.evaluation.score import progress_of_part
-from lidardesign.scoring.evaluation.seeds import over_seeds
+from lidardesign.evaluation.request import usual_numbers
+from lidardesign.evaluation.score import progress_of_part
+from lidardesign.evaluation.seeds import over_seeds
 
 if TYPE_CHECKING:
-    from lidardesign.scoring.baselines.cma import Show
+    from lidardesign.methods.cma import Show
 
 FEWEST_RUNS = 2
 SEED = "seed"

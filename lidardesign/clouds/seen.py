@@ -18,7 +18,7 @@ from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.mesh_files import OTHER_FORMATS, SUFFIXES, Y_UP, load_mesh
 from lidardesign.scenes.rays import Returns
 from lidardesign.scenes.scene import Body, Round, Scene, inverse_rigid
-from lidardesign.scoring.evaluation.request import fired_numbers
+from lidardesign.evaluation.request import fired_numbers
 from lidardesign.scoring.fired import Positions, fired
 from lidardesign.scoring.scene_scores import returns_in_scene
 from lidardesign.sensors.design import DesignSpec

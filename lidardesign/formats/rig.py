@@ -163,7 +163,7 @@ def rig_design(rig: Rig, path: Path, reach_m: float | None) -> DesignSpec:
     ordered = (np.concatenate([getattr(one, name) for one in gated])[order] for name in columns)
     return DesignSpec(
         path.stem,
-        tuple(_sensor(one, name, total) for one, name in zip(gated, names, strict=True)),
+        tuple(sensor_of(one, name, total) for one, name in zip(gated, names, strict=True)),
         layout="fixed",
         patterns=(Pattern.of(Rays.from_angles(*ordered, sensor=np.repeat(np.arange(len(gated)), counts)[order])),),
         provenance={"source": path.name, "format": rig.kind, "notes": notes},
@@ -194,7 +194,8 @@ def number_of(text: str) -> float | None:
         return None
 
 
-def _sensor(one: RigSensor, name: str, total: int) -> Sensor:
+def sensor_of(one: RigSensor, name: str, total: int) -> Sensor:
+    """The sensor that fires the rays of a rig's, under a name, with its share of all rays."""
     single = Aim(float(one.azimuth_rad[0]), float(one.elevation_rad[0]), 0.0, (0.0, 0.0))
     count = len(one.azimuth_rad)
     aim = one.aim or (single if count == 1 else aim_of(direction(one.azimuth_rad, one.elevation_rad)))

@@ -19,7 +19,7 @@ from lidardesign.report.density_views import Marginal, PlaneDensity
 from lidardesign.report.markup import encoded
 from lidardesign.report.scene_figure import frustum_lines
 from lidardesign.scenes.rays import Outcome, Rays
-from lidardesign.scoring.evaluation.results import Evaluation, Row
+from lidardesign.evaluation.results import Evaluation, Row
 from lidardesign.sensors.design import DesignSpec
 
 if TYPE_CHECKING:

@@ -54,9 +54,9 @@ from lidardesign.report.view import view_section
 from lidardesign.run.clock import phase
 from lidardesign.run.files import write_atomic
 from lidardesign.run.manifest import read_manifest, versions
-from lidardesign.scoring.evaluation.headline import headline_texts
-from lidardesign.scoring.evaluation.request import EvaluationRequest
-from lidardesign.scoring.evaluation.results import Evaluation, Paired, Row, verdict
+from lidardesign.evaluation.headline import headline_texts
+from lidardesign.evaluation.request import EvaluationRequest
+from lidardesign.evaluation.results import Evaluation, Paired, Row, verdict
 from lidardesign.scoring.sweep import Sweep
 from lidardesign.sensors.design import MOST_GAP, DesignSpec
 from lidardesign.space import observed_point

@@ -19,8 +19,8 @@ from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import Outcome, Rays, gate_outcomes
 from lidardesign.scenes.scene import Body, Box, Mesh, Plane, Round, Scene
 from lidardesign.scenes.surface import BOX_CORNERS, BOX_QUADS, grid_faces, round_triangles
-from lidardesign.scoring.evaluation.request import EvaluationRequest, numbers_fired
-from lidardesign.scoring.evaluation.results import Evaluation
+from lidardesign.evaluation.request import EvaluationRequest, numbers_fired
+from lidardesign.evaluation.results import Evaluation
 from lidardesign.scoring.fired import Positions, fired
 from lidardesign.sensors.adaptive import AdaptiveRays
 from lidardesign.sensors.design import DesignSpec

@@ -11,8 +11,8 @@ from typing import Any
 from lidardesign.constraints.slack import ConstraintSlack
 from lidardesign.report.markup import definitions, folded
 from lidardesign.run.clock import INSIDE, OTHER
-from lidardesign.scoring.evaluation.entries import MILLIMETRES, EffectSummary
-from lidardesign.scoring.evaluation.results import (
+from lidardesign.evaluation.entries import MILLIMETRES, EffectSummary
+from lidardesign.evaluation.results import (
     Audit,
     AuditRow,
     Evaluation,

@@ -50,8 +50,14 @@ class Pattern:
     @classmethod
     def of(cls, rays: Rays) -> Pattern:
         """The pattern of a list of rays."""
-        columns = (rays.origin_m, rays.azimuth_rad, rays.elevation_rad, rays.gate_m)
-        return cls(*(column[None] for column in columns), rays.sensor)
+        return cls.stacked([rays])
+
+    @classmethod
+    def stacked(cls, lists: Sequence[Rays], dimension: str | None = None, knots: Sequence[float] = ()) -> Pattern:
+        """The pattern of lists of rays at ascending knots as they are: ray n need not be one ray at all of them."""
+        names = ("origin_m", "azimuth_rad", "elevation_rad", "gate_m")
+        columns = (np.stack([getattr(rays, name) for rays in lists]) for name in names)
+        return cls(*columns, lists[0].sensor, dimension, tuple(map(float, knots)))
 
     @classmethod
     def along(cls, dimension: str, knots: Sequence[float], lists: Sequence[Rays], ends: tuple[float, float]) -> Pattern:

@@ -12,7 +12,7 @@ from support.command_line import make_run
 import lidardesign as package
 from lidardesign.config import load_run_config, save_run_config, with_task_settings
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.scoring.evaluation.seeds import two_way_interval
+from lidardesign.evaluation.seeds import two_way_interval
 
 SMALL, ALONE = ("--rays", 8, "--set", "test=5"), ("--baseline", "none")
 OPTIONS = {"rays": [8], "settings": {"test": 5}}

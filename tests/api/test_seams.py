@@ -13,8 +13,8 @@ from support.scoring import MissTask
 
 from lidardesign.samples import Samples
 from lidardesign.scenes.scene import Body, Capsule, Mesh, Scene, Sphere, rigid
-from lidardesign.scoring.evaluation.request import EvaluationRequest
-from lidardesign.scoring.evaluation.score import evaluate
+from lidardesign.evaluation.request import EvaluationRequest
+from lidardesign.evaluation.score import evaluate
 from lidardesign.space import DesignSpace, aim
 from lidardesign.task import Metric, Score, TaskConfig
 

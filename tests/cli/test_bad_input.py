@@ -471,7 +471,7 @@ def nothing_is_worked_for(monkeypatch):
 
     for work in ("scores.ScoreRequest.score", "export.ExportRequest.write", "design.Design.fitted"):
         monkeypatch.setattr(f"lidardesign.api.{work}", refuse)
-    monkeypatch.setattr("lidardesign.scoring.captures.capture.load_capture", refuse)
+    monkeypatch.setattr("lidardesign.evaluation.captures.capture.load_capture", refuse)
 
 
 def the_disk_is_full(monkeypatch):

@@ -22,7 +22,7 @@ from lidardesign.density.objective.target import Target, build_target
 from lidardesign.density.objective.visibility import NoVisibility, Optics
 from lidardesign.scenes.mesh_files import check_mesh, unique_rows
 from lidardesign.scenes.scene import Body, Box, Mesh, Scene, Sphere, rigid
-from lidardesign.scoring.accuracy.fields import exact_distances
+from lidardesign.evaluation.accuracy.fields import exact_distances
 from lidardesign.space import DesignSpace
 
 BALL = trimesh.creation.icosphere(subdivisions=2, radius=0.5)

@@ -12,7 +12,7 @@ from support.command_line import make_run
 
 from lidardesign.errors import ConfigError
 from lidardesign.scenes.rays import Rays
-from lidardesign.scoring.evaluation.request import (
+from lidardesign.evaluation.request import (
     counts_without_baselines,
     fired_numbers,
     missing_row_notes,

@@ -13,8 +13,8 @@ from support.sensors import normal_sensor
 
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.formats.galvo import degree_frame, scan_directions, write_galvo
-from lidardesign.scoring.captures.capture import Capture, load_capture
-from lidardesign.scoring.captures.scan import (
+from lidardesign.evaluation.captures.capture import Capture, load_capture
+from lidardesign.evaluation.captures.scan import (
     Captured,
     Estimation,
     default_within_rad,
@@ -24,7 +24,7 @@ from lidardesign.scoring.captures.scan import (
     uniform_rays,
     whole_window,
 )
-from lidardesign.scoring.captures.score import CaptureSettings, evaluate_capture
+from lidardesign.evaluation.captures.score import CaptureSettings, evaluate_capture
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import save_design
 from lidardesign.simulate.detector import physics

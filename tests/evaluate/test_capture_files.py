@@ -12,8 +12,8 @@ from support.captures import BINS, make_capture
 
 from lidardesign.errors import DataError
 from lidardesign.run.inputs import CAPTURE
-from lidardesign.scoring.captures import capture as matlab
-from lidardesign.scoring.captures.capture import load_capture, read_arrays
+from lidardesign.evaluation.captures import capture as matlab
+from lidardesign.evaluation.captures.capture import load_capture, read_arrays
 
 
 def save_npz(path, arrays):
@@ -241,7 +241,7 @@ def test_garbage_and_nothing_are_refused(tmp_path, suffix):
 
 def test_files_above_the_stated_size_are_refused_before_they_are_read(tmp_path, monkeypatch):
     small = replace(CAPTURE, most_bytes=100_000, unpacked_bytes=100_000)
-    monkeypatch.setattr("lidardesign.scoring.captures.capture.CAPTURE", small)
+    monkeypatch.setattr("lidardesign.evaluation.captures.capture.CAPTURE", small)
     zeros = {**make_capture(3), "counts": np.zeros((3, 3, 100_000), np.uint8)}
     for kind, save in FORMATS.items():
         path = path_of(tmp_path, kind)

@@ -22,8 +22,8 @@ from lidardesign.parts.catalogue import Pose, find_part, part_design
 from lidardesign.scoring.baselines import cma
 from lidardesign.scoring.baselines.candidates import rays_at
 from lidardesign.scoring.baselines.cma import CmaCandidate, CmaSettings, MovableSensors
-from lidardesign.scoring.evaluation.entries import entries_of
-from lidardesign.scoring.evaluation.score import evaluate
+from lidardesign.evaluation.entries import entries_of
+from lidardesign.evaluation.score import evaluate
 from lidardesign.scoring.scene_scores import TrainingScorer
 from lidardesign.sensors.adaptive import mean_mbps
 from lidardesign.sensors.bandwidth import Bandwidth

@@ -12,8 +12,8 @@ from support.sensors import normal_sensor
 
 from lidardesign.errors import ConfigError
 from lidardesign.scenes.scene import Body, Box, Capsule, Scene, Sphere, rigid
-from lidardesign.scoring.evaluation.entries import entries_of
-from lidardesign.scoring.evaluation.score import evaluate
+from lidardesign.evaluation.entries import entries_of
+from lidardesign.evaluation.score import evaluate
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.pattern import Pattern

@@ -9,10 +9,10 @@ from support.evaluations import METRIC
 from support.references import STANDARD_ERRORS
 from support.scoring import design, make_request, scenes
 
-from lidardesign.scoring.accuracy import evaluation as sweeps
-from lidardesign.scoring.accuracy.probes import AccuracyRequest
-from lidardesign.scoring.evaluation.results import Evaluation, Row
-from lidardesign.scoring.evaluation.score import evaluate
+from lidardesign.evaluation.accuracy import evaluation as sweeps
+from lidardesign.evaluation.accuracy.probes import AccuracyRequest
+from lidardesign.evaluation.results import Evaluation, Row
+from lidardesign.evaluation.score import evaluate
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.plan import Planner
 from lidardesign.space import DesignSpace

@@ -17,8 +17,8 @@ from lidardesign.scoring.baselines import greedy as greedy_module
 from lidardesign.scoring.baselines.candidates import whole_range
 from lidardesign.scoring.baselines.greedy import Fired, GreedyCandidate, greedy_rays
 from lidardesign.scoring.baselines.views import TrainingViews
-from lidardesign.scoring.evaluation.entries import entries_of
-from lidardesign.scoring.evaluation.score import evaluate
+from lidardesign.evaluation.entries import entries_of
+from lidardesign.evaluation.score import evaluate
 from lidardesign.sensors.adaptive import mean_mbps
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.pattern import Pattern

@@ -11,10 +11,10 @@ from support.scoring import HitTask, MissTask, design, make_request
 
 from lidardesign.errors import ThresholdError
 from lidardesign.estimates import paired_difference
-from lidardesign.scoring.evaluation.entries import StrongestBaseline
-from lidardesign.scoring.evaluation.headline import check_better, check_limit, difference_text, headline_texts
-from lidardesign.scoring.evaluation.results import Evaluation, Paired, verdict
-from lidardesign.scoring.evaluation.score import evaluate
+from lidardesign.evaluation.entries import StrongestBaseline
+from lidardesign.evaluation.headline import check_better, check_limit, difference_text, headline_texts
+from lidardesign.evaluation.results import Evaluation, Paired, verdict
+from lidardesign.evaluation.score import evaluate
 
 
 @pytest.mark.parametrize(

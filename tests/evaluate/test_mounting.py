@@ -16,9 +16,9 @@ from lidardesign.api.run import open_run
 from lidardesign.errors import ConfigError
 from lidardesign.estimates import paired_difference
 from lidardesign.report.tables import mounting_table
-from lidardesign.scoring.evaluation.mounting import MountError
-from lidardesign.scoring.evaluation.score import evaluate
-from lidardesign.scoring.evaluation.seeds import over_seeds
+from lidardesign.evaluation.mounting import MountError
+from lidardesign.evaluation.score import evaluate
+from lidardesign.evaluation.seeds import over_seeds
 
 DEGREE = math.pi / 180
 ERROR = MountError(0.005, 0.5 * DEGREE)

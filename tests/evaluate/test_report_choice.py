@@ -12,7 +12,7 @@ from support.report_pages import NASTY, make_row, make_sensor
 
 from lidardesign.report.choice import choice_section, correlation_sentence
 from lidardesign.report.figures import series
-from lidardesign.scoring.evaluation.results import Evaluation
+from lidardesign.evaluation.results import Evaluation
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.task import Metric
 

@@ -7,8 +7,8 @@ import pytest
 from support.report_pages import NASTY, make_evaluation, make_row, make_sensor
 
 from lidardesign.report.page import result_section
-from lidardesign.scoring.evaluation.entries import StrongestBaseline
-from lidardesign.scoring.evaluation.results import Evaluation, Paired
+from lidardesign.evaluation.entries import StrongestBaseline
+from lidardesign.evaluation.results import Evaluation, Paired
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.task import Metric
 

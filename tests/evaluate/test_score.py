@@ -16,9 +16,9 @@ from lidardesign.report.tables import paired_tables
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import rigid
 from lidardesign.scoring.baselines import candidates
-from lidardesign.scoring.evaluation.entries import FEWEST_BASELINE_SCENES
-from lidardesign.scoring.evaluation.results import csv_text, verdict
-from lidardesign.scoring.evaluation.score import evaluate
+from lidardesign.evaluation.entries import FEWEST_BASELINE_SCENES
+from lidardesign.evaluation.results import csv_text, verdict
+from lidardesign.evaluation.score import evaluate
 from lidardesign.scoring.scene_scores import silent_notes
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.space import DesignSpace

@@ -9,8 +9,8 @@ from support.scoring import design, make_request, rows_by_key
 
 from lidardesign.errors import NumericalError
 from lidardesign.estimates import mean_interval
-from lidardesign.scoring.evaluation.score import evaluate
-from lidardesign.scoring.evaluation.seeds import over_seeds, two_way_interval
+from lidardesign.evaluation.score import evaluate
+from lidardesign.evaluation.seeds import over_seeds, two_way_interval
 
 TRIALS = 1500
 # Four standard errors of a share of 95 % over so many trials.

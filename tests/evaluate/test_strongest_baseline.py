@@ -10,16 +10,16 @@ from support.evaluations import make_row
 from support.scoring import HitTask, MissTask, design, make_request, scenes
 
 from lidardesign.scenes.casting import SceneCaster
-from lidardesign.scoring.evaluation.entries import (
+from lidardesign.evaluation.entries import (
     FEWEST_BASELINE_SCENES,
     LARGEST_BASELINE_SHARE,
     MOST_BASELINE_SCENES,
     entries_of,
     mean_baseline,
 )
-from lidardesign.scoring.evaluation.results import middle_rays
-from lidardesign.scoring.evaluation.score import evaluate
-from lidardesign.scoring.evaluation.seeds import over_seeds
+from lidardesign.evaluation.results import middle_rays
+from lidardesign.evaluation.score import evaluate
+from lidardesign.evaluation.seeds import over_seeds
 
 HELD_BACK = scenes(31, 40, side=0.3)
 

@@ -21,10 +21,10 @@ from lidardesign.density.training.trainer import Trainer
 from lidardesign.errors import DataError, NumericalError
 from lidardesign.registry import load_task
 from lidardesign.run.manifest import start_manifest
-from lidardesign.scoring.accuracy import evaluation as accuracy
-from lidardesign.scoring.accuracy import fields, training
-from lidardesign.scoring.accuracy.probes import AccuracyRequest
-from lidardesign.scoring.evaluation.request import EvaluationRequest
+from lidardesign.evaluation.accuracy import evaluation as accuracy
+from lidardesign.evaluation.accuracy import fields, training
+from lidardesign.evaluation.accuracy.probes import AccuracyRequest
+from lidardesign.evaluation.request import EvaluationRequest
 from lidardesign.scoring.sweep import Accuracy
 from lidardesign.task import random_generator, scenes_of
 

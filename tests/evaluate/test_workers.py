@@ -16,7 +16,7 @@ from support.workers import make_request, random_rays, results
 
 from lidardesign import errors, workers
 from lidardesign.errors import ConfigError, LidardesignError, PluginError
-from lidardesign.scoring.evaluation.score import evaluate
+from lidardesign.evaluation.score import evaluate
 from lidardesign.scoring.scene_scores import score_scenes
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.plan import Planner

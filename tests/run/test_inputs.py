@@ -29,7 +29,7 @@ from lidardesign.run.xml import read_xml
 from lidardesign.run.yaml import load_yaml
 from lidardesign.scenes.mesh_files import SUFFIXES, list_mesh_files, load_mesh
 from lidardesign.scenes.mujoco_models import model_files
-from lidardesign.scoring.captures.capture import load_capture
+from lidardesign.evaluation.captures.capture import load_capture
 from lidardesign.simulate.detector.files import load_detector
 
 DOCS = Path(__file__).parents[2] / "docs" / "formats.md"

@@ -24,7 +24,7 @@ from lidardesign.errors import DataError
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import Outcome, Rays, path_of_range, path_windows, range_of_path
 from lidardesign.scenes.scene import Body, Box, Plane, Receiver, Scene, Sphere, rigid
-from lidardesign.scoring.evaluation.score import evaluate
+from lidardesign.evaluation.score import evaluate
 from lidardesign.scoring.metrics import (
     chamfer_m,
     delaunay_surface,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidardesign.scoring.evaluation.results import Evaluation, Paired, Row
+from lidardesign.evaluation.results import Evaluation, Paired, Row
 from lidardesign.task import Metric
 
 METRIC = Metric("Chamfer distance", "mm", "lower", worst=200.0, tolerance=0.1)

@@ -16,7 +16,7 @@ from lidardesign.samples import Samples
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import Outcome, Rays, gate_outcomes
 from lidardesign.scenes.scene import Body, Box, Capsule, Plane, Scene, Sphere, rigid
-from lidardesign.scoring.evaluation.results import Evaluation, Paired
+from lidardesign.evaluation.results import Evaluation, Paired
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.space import DesignSpace
 from lidardesign.task import Metric

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidardesign.scoring.evaluation.request import EvaluationRequest
+from lidardesign.evaluation.request import EvaluationRequest
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.space import DesignSpace
 from lidardesign.task import Defaults, Metric, Score, TaskConfig

@@ -8,7 +8,7 @@ import numpy as np
 from lidardesign_tasks.flatland import FlatlandConfig, FlatlandTask
 
 from lidardesign.scenes.rays import Rays
-from lidardesign.scoring.evaluation.request import EvaluationRequest
+from lidardesign.evaluation.request import EvaluationRequest
 from lidardesign.sensors.design import DesignSpec
 from support.sensors import normal_sensor
 

@@ -21,7 +21,7 @@ from lidardesign.run.outputs import check_outputs
 
 if TYPE_CHECKING:
     from lidardesign.scenes.rays import Rays
-    from lidardesign.scoring.captures.score import CaptureEvaluation
+    from lidardesign.evaluation.captures.score import CaptureEvaluation
 
 COLUMNS = {
     "rays": "rays",
@@ -59,9 +59,9 @@ def capture(
     if not (math.isfinite(outlier_mm) and outlier_mm > 0):
         raise ConfigError(f"{outlier_mm}", where="--outlier-mm", allowed="a finite number above 0")
     with phase("libraries"):
-        from lidardesign.scoring.captures.capture import load_capture
-        from lidardesign.scoring.captures.scan import Estimation, default_within_rad
-        from lidardesign.scoring.captures.score import CaptureSettings, evaluate_capture, write_csv
+        from lidardesign.evaluation.captures.capture import load_capture
+        from lidardesign.evaluation.captures.scan import Estimation, default_within_rad
+        from lidardesign.evaluation.captures.score import CaptureSettings, evaluate_capture, write_csv
         from lidardesign.space import condition_values
 
     place = condition_values(choices["at"])

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from lidardesign.api.scores import ScoreRequest, Scores
     from lidardesign.api.seeds import SeedsRequest
     from lidardesign.cli.terminal.grids import ProgressDisplay
-    from lidardesign.scoring.baselines.cma import Show
+    from lidardesign.methods.cma import Show
 
 
 @command_line(EvaluateCommand, NamedChoices, Printed)

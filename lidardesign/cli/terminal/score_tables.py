@@ -11,7 +11,7 @@ from lidardesign.cli.terminal.grids import RichConsole, difference_cell, duratio
 from lidardesign.run.clock import INSIDE, OTHER
 
 if TYPE_CHECKING:
-    from lidardesign.scoring.evaluation.results import Evaluation
+    from lidardesign.evaluation.results import Evaluation
     from lidardesign.scoring.sweep import Accuracy, Measurement, Sweep
 
 
@@ -37,7 +37,7 @@ def show_evaluation(document: Entry, evaluation: Evaluation, rich: RichConsole, 
 
 def _show_designs(document: Entry, evaluation: Evaluation, rich: RichConsole) -> None:
     """Print a row per design and baseline of `baseline_rows`, and a line on each further result."""
-    from lidardesign.scoring.evaluation.headline import difference_text, headline_texts
+    from lidardesign.evaluation.headline import difference_text, headline_texts
 
     rows, pairs = evaluation.headline_rows, evaluation.headline_pairs
     baseline = evaluation.strongest_baseline

@@ -12,7 +12,7 @@ from pydantic import TypeAdapter, ValidationError
 from lidardesign.run.files import sha256_file
 
 if TYPE_CHECKING:
-    from lidardesign.scoring.evaluation.results import Evaluation
+    from lidardesign.evaluation.results import Evaluation
 
 SCORES = "scores"
 

@@ -32,12 +32,11 @@ from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import Progress, phase
 from lidardesign.scenes.scene import Scene, group_numbers
 from lidardesign.scenes.triangles import SecondCasts
-from lidardesign.scoring.baselines.cma import CMA
-from lidardesign.scoring.baselines.greedy import GREEDY, greedy_rays
-from lidardesign.scoring.evaluation.entries import Entry, effect_notes, effect_summaries, entries_of, strongest_baseline
-from lidardesign.scoring.evaluation.mounting import MountError
-from lidardesign.scoring.evaluation.request import EvaluationRequest, missing_row_notes
-from lidardesign.scoring.evaluation.results import Audit, Evaluation, Mounting, Paired, Row, audit_rows, middle_rays
+from lidardesign.evaluation.entries import Entry, design_entries, effect_notes, effect_summaries, strongest_baseline
+from lidardesign.evaluation.mounting import MountError
+from lidardesign.evaluation.request import EvaluationRequest, fired_numbers, missing_row_notes
+from lidardesign.evaluation.rivals import Rivals, rivals_of
+from lidardesign.evaluation.results import Audit, Evaluation, Mounting, Paired, Row, audit_rows, middle_rays
 from lidardesign.scoring.fired import Positions, without_each
 from lidardesign.scoring.scene_scores import score_scenes, silent_notes
 from lidardesign.sensors.adaptive import AdaptiveRays
@@ -74,7 +73,10 @@ def evaluate(request: EvaluationRequest, progress: Progress | None = None) -> Ev
         PluginError: The task's score raised, or returned something that is no finite score.
     """
     request.check()
-    entries = entries_of(request)
+    counts = fired_numbers(request.designs, request.rays)
+    designs = design_entries(request, counts)
+    rivals = rivals_of(request, designs, [count for count in counts if count not in request.alone])
+    entries = [*designs, *rivals.entries]
     passes = 1 + request.audit + bool(request.sensors_to_lose) + (request.mount_error is not None)
     scored = _score_all(request, entries, request.planner, progress_of_part(progress, 0, passes))
     losses = (
@@ -102,7 +104,7 @@ def evaluate(request: EvaluationRequest, progress: Progress | None = None) -> Ev
         equal_bandwidth=matched,
         paired_bandwidth=_bandwidth_pairs(plain, matched, request.metric),
         notes=[
-            *_notes(request, entries, matched),
+            *_notes(request, entries, rivals, matched),
             *worst_notes([*plain, *matched], request.metric),
             *(search.note(request.designs[0].name, request.metric) for search in searches),
             *slipped_notes(scored.second_casts),
@@ -280,33 +282,26 @@ def _bandwidth_pairs(rows: Sequence[Row], matched: Sequence[Row], metric: Metric
     return [_pair(designs[row.matched_to, row.matched_rays], row, metric, row.rays) for row in matched]
 
 
-def _notes(request: EvaluationRequest, entries: Sequence[Entry], matched: Sequence[Row]) -> list[str]:
+def _notes(
+    request: EvaluationRequest, entries: Sequence[Entry], rivals: Rivals, matched: Sequence[Row]
+) -> list[str]:
     positions = max(len(entry.positions) for entry in entries if not isinstance(entry.positions, AdaptiveRays))
     notes = missing_row_notes(request.designs, request.rays, request.alone)
     if positions > 1:
         counted = f"rays and bandwidth are per position; every scene is seen from {positions} positions"
         notes.append(BackgroundNote(counted))
     notes += group_notes(request.test)
-    if GREEDY in request.baselines and request.training is not None:
-        notes += greedy_rays(request.task, positions, set(request.rays).difference(request.alone))[1]
+    notes += rivals.refused
     with plugin_guard(request.task.name):
         notes += notes_of(request.task, request.config, request.space)
     for design in request.designs:
         notes += outside_notes(design, request.space) + light_notes(design, request.planner.detector)
         notes += broken_notes(design.name, check_design(design_document(design), design.constraints, request.space))
     own = sorted((entry for entry in entries if not entry.baseline), key=lambda entry: entry.rays)
-    shared = [entry for entry in own if entry.rays not in request.alone]
     # of each design the most rays, which come last
     notes += silent_notes(request.test, {f"{entry.name!r}": entry.positions for entry in own})
-    found = {(row.matched_to, row.matched_rays, row.design) for row in matched}
-    beyond = {
-        (entry.name, name)
-        for entry in shared
-        for name in request.baselines
-        if request.equal_bandwidth and name not in (CMA, GREEDY) and (entry.name, entry.rays, name) not in found
-    }
-    if beyond:
-        designs, names = (", ".join(sorted(set(column))) for column in zip(*beyond, strict=True))
+    if rivals.unbounded:
+        designs, names = (", ".join(sorted(set(column))) for column in zip(*rivals.unbounded, strict=True))
         notes.append(
             f"more than {MOST_RAYS:,} rays of {names} fit in the bandwidth of {designs}: they are not compared at "
             "equal bandwidth; the gates are far longer than what scenes return"

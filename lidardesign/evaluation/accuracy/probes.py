@@ -20,8 +20,8 @@ from lidardesign.density.training.losses import Pool
 from lidardesign.density.training.quality import misplaced_share
 from lidardesign.run.manifest import read_manifest
 from lidardesign.scenes.scene import Scene
-from lidardesign.scoring.evaluation.request import EvaluationRequest
-from lidardesign.scoring.evaluation.results import Evaluation
+from lidardesign.evaluation.request import EvaluationRequest
+from lidardesign.evaluation.results import Evaluation
 from lidardesign.scoring.sweep import Measurement, Sweep
 from lidardesign.task import random_generator
 

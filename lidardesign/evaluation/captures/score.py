@@ -23,8 +23,8 @@ from lidardesign.run.files import write_atomic
 from lidardesign.scenes.mesh_files import load_mesh
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Body, Scene
-from lidardesign.scoring.captures.capture import Capture
-from lidardesign.scoring.captures.scan import (
+from lidardesign.evaluation.captures.capture import Capture
+from lidardesign.evaluation.captures.scan import (
     Captured,
     CapturedScan,
     Estimation,

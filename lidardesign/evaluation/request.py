@@ -17,9 +17,9 @@ from lidardesign.rays.training_scenes import TrainingScenes
 from lidardesign.registry import plugin_guard
 from lidardesign.samples import Samples
 from lidardesign.scenes.scene import Scene
-from lidardesign.scoring.baselines.cma import CmaSettings
-from lidardesign.scoring.baselines.simple import ALWAYS, BASELINES, check_baseline
-from lidardesign.scoring.evaluation.mounting import MountError
+from lidardesign.problem.method import METHODS
+from lidardesign.problem.world import World
+from lidardesign.evaluation.mounting import MountError
 from lidardesign.scoring.scene_scores import TrainingScorer
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design import DesignSpec
@@ -28,6 +28,8 @@ from lidardesign.space import DesignSpace
 from lidardesign.task import Metric, Task, conditions_of, metric_of, mount_of
 from lidardesign.workers import Starmap
 
+# What stands beside every design, asked for or not.
+ALWAYS = ("uniform", "random", "bounding", "silhouette", "greedy")
 # Fixed patterns of more rays are scored without baselines, unless their number is asked for: some have 100,000.
 MOST_SHARED = 2000
 
@@ -51,7 +53,7 @@ class EvaluationRequest:
             bandwidth [Mbit/s] or without a limit; None where there is none.
         density: Samples of what was learned, for figures; None where a run has none.
         training: Scenes that the baseline `greedy` chooses on; None: it is left out.
-        cma: Limits and progress of the searches of the baseline `cma`.
+        settings: Settings of methods by their names.
         planner: The detector, and how the effects that are simulated are chosen.
         audit: Whether all rows are scored under all effects too.
         mount_error: Mounting errors of sensors in further rows; None: there are none.
@@ -76,7 +78,7 @@ class EvaluationRequest:
     without_visibility: Callable[[int, float | None], DesignSpec] | None = None
     density: Callable[[], Samples | None] = lambda: None
     training: TrainingScenes | None = None
-    cma: CmaSettings = field(default_factory=CmaSettings)
+    settings: Mapping[str, Any] = field(default_factory=dict)
     planner: Planner = field(default_factory=Planner)
     audit: bool = False
     mount_error: MountError | None = None
@@ -123,17 +125,31 @@ class EvaluationRequest:
                 raise ConfigError(f"{design.name} is mounted on the body {design.mount!r}", where=where, allowed=there)
         names = [design.name for design in self.designs]
         for name in names:
-            if names.count(name) > 1 or name in BASELINES:
-                other = "a baseline" if name in BASELINES else "another design"
+            if names.count(name) > 1 or name in self.baselines:
+                other = "a baseline" if name in self.baselines else "another design"
                 raise ConfigError(f"a design has the same name as {other}: {name!r}", hint="rename its file")
         for name in self.baselines:
             check_baseline(name, where="--baseline")
         if any(count < 1 for count in self.rays):
             raise ConfigError(f"{min(self.rays)} rays", where="--rays", allowed="1 or more")
 
-    def scorer(self, scenes: Iterable[Scene], *, keeps_casters: bool = False) -> TrainingScorer:
+    def scorer(self, scenes: Iterable[Scene]) -> TrainingScorer:
         """A scorer of training scenes, under the effects of the evaluation."""
-        return TrainingScorer(self.task, self.metric, self.seed, scenes, self.planner, keeps_casters=keeps_casters)
+        return TrainingScorer(self.task, self.metric, self.seed, scenes, self.planner)
+
+    def world(self) -> World:
+        """The training scenes that baselines are made from."""
+        return World(self.task, self.config, self.space, self.seed, self.train, self.training, self.planner)
+
+
+def check_baseline(name: str, *, where: str = "baselines") -> None:
+    """Refuse a name that is no method's.
+
+    Raises:
+        ConfigError: There is no such method.
+    """
+    if name not in METHODS.names():
+        raise ConfigError(f"unknown baseline {name!r}", where=where, allowed=METHODS.allowed())
 
 
 def numbers_fired(design: DesignSpec, asked: Iterable[int], alone: Sequence[int] = ()) -> list[int]:

@@ -1,4 +1,4 @@
-"""The baseline `greedy`: rays and gates chosen on training scenes as a design's are, but without any density.
+"""The method `greedy`: rays and gates chosen on training scenes as a design's are, but without any density.
 
 Candidates are even over where training scenes return: on the lattice of `silhouette`, with free origins in the crops of
 `bounding`. Rays and gates are chosen as by `fit`: by the task's information about
@@ -13,54 +13,87 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from lidardesign.methods.bounding import Crop, crop_kinds
+from lidardesign.methods.fields import even_placement
+from lidardesign.methods.laid_out import even_layout, most_within, rays_at
+from lidardesign.methods.returns import RAY_AXES, TrainingReturns, returns_of, whole_range
+from lidardesign.methods.silhouette import LEAST_SHARE, lattice_rays, survey
 from lidardesign.numerics import COARSE_SLACK
+from lidardesign.problem.method import API_VERSION, INFORMS
+from lidardesign.problem.problem import DesignResult, Fired, Problem, ray_design
+from lidardesign.rays.information import informs_rays
+from lidardesign.rays.proposals import CANDIDATES_PER_RAY
 from lidardesign.rays.training_scenes import CHOICE, InformedScene, TrainingScenes
 from lidardesign.run.clock import phase
 from lidardesign.scenes.rays import Rays, fire_times
-from lidardesign.scoring.baselines.candidates import most_within, rays_at, whole_range
-from lidardesign.scoring.baselines.even import Crop, crop_kinds, even_placement
-from lidardesign.scoring.baselines.silhouette import LEAST_SHARE, lattice_rays, survey
-from lidardesign.scoring.baselines.views import RAY_AXES, TrainingViews
 from lidardesign.scoring.fired import Positions
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.space import AZIMUTH, DesignSpace
-from lidardesign.task import Task
 
 if TYPE_CHECKING:
     from lidardesign.rays.coverage import Coverage
     from lidardesign.rays.selection import Selection
 
-GREEDY = "greedy"
 USUAL_SCENES = 200  # that rays are chosen on where no design has a number of its own
 # Rays over all values of a condition: choosing more would take longer than all else in an evaluation.
 MOST_CHOSEN = 2000
 SMALLEST_SHARE = 0.1  # of even rays that return: where fewer do, candidates are those that return most often
 
 
-def greedy_rays(task: Task, positions: int, counts: Iterable[int]) -> tuple[list[int], list[str]]:
-    """The numbers of rays that `greedy` can choose at `positions` condition values, and notes on the others."""
-    from lidardesign.rays.information import informs_rays
+class Greedy:
+    """The method: see `Method`."""
 
-    if not informs_rays(task):
-        return [], [f"{GREEDY} is left out: the task {task.name} has no method informs"]
-    most = MOST_CHOSEN // positions
-    beyond = any(count > most for count in counts)
-    notes = [f"{GREEDY} is left out above {most} rays: choosing them takes too long"] if beyond else []
-    return [count for count in counts if count <= most], notes
+    name = "greedy"
+    summary = "rays and gates chosen on training scenes as a design's are, without a density"
+    api_version = API_VERSION
+    needs = frozenset({INFORMS})
+    is_redrawn = False
+
+    def refuses(self, problem: Problem) -> str | None:
+        """See `Method`: choosing many rays would take longer than all else in an evaluation."""
+        world, most = problem.world, MOST_CHOSEN // len(problem.world.conditions)
+        if world.training is None:
+            return ""
+        if not informs_rays(world.task):
+            return f"the task {world.task.name} has no method informs"
+        return None if problem.asked <= most else f"choosing more than {most} rays takes too long"
+
+    def design(self, problem: Problem) -> DesignResult | None:
+        """See `Method`."""
+        world, views = problem.world, returns_of(problem.world)
+        if not len(views.observed(world.space)):
+            found = world.known("even rays", lambda: even_layout(world.space)).within(problem)
+            return None if found is None else DesignResult(ray_design(self.name, found, world))
+        choice = world.known((self.name, problem.gates), lambda: self._choice(problem, views))
+        within = problem.rays is None
+        lists = choice.positions_within(problem.limit_mbps) if within else choice.positions(problem.asked)
+        return DesignResult(ray_design(self.name, lists, world))
+
+    def _choice(self, problem: Problem, views: TrainingReturns) -> GreedyChoice:
+        world, compared = problem.world, problem.compared
+        most = MOST_CHOSEN // len(world.conditions)
+        scenes = [one["scenes"] for design in compared.designs for one in design.certificates]
+        counts = [count for count in compared.counts or [problem.asked] if count <= most]
+        return GreedyChoice(
+            views=views,
+            spaces=world.spaces,
+            training=world.training,
+            scenes=max(scenes, default=USUAL_SCENES),
+            gates_per_ray=problem.gates == "ray",
+            candidates=CANDIDATES_PER_RAY * max(counts),
+            fired=compared.fired,
+            bandwidth=problem.readout,
+        )
 
 
-class Fired(NamedTuple):
-    """The number of rays of a design compared with, and their bandwidth [Mbit/s]."""
-
-    rays: int
-    mbps: float
+GREEDY = Greedy()
 
 
 class _Table(NamedTuple):
@@ -72,8 +105,8 @@ class _Table(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class GreedyCandidate:
-    """Chosen rays as a baseline's layout.
+class GreedyChoice:
+    """Rays that are chosen for any number of them.
 
     Arguments:
         views: The training scenes, for their returns.
@@ -86,9 +119,7 @@ class GreedyCandidate:
         bandwidth: The read-out model.
     """
 
-    name: ClassVar[str] = GREEDY
-    drawn_anew: ClassVar[bool] = False
-    views: TrainingViews
+    views: TrainingReturns
     spaces: Sequence[DesignSpace]
     training: TrainingScenes
     scenes: int
@@ -97,17 +128,17 @@ class GreedyCandidate:
     fired: Sequence[Fired]
     bandwidth: Bandwidth
 
-    def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> Positions:
-        """See `Candidate`; in no more than the largest bandwidth of a design with so many rays."""
+    def positions(self, count: int) -> Positions:
+        """So many rays at each value, in no more than the largest bandwidth of a design with as many."""
         limits = [one.mbps for one in self.fired if one.rays == count] if self.gates_per_ray else []
         return self._chosen(count, max(limits, default=np.inf))
 
-    def positions_within(self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth) -> Positions:
+    def positions_within(self, limit_mbps: float) -> Positions:
         """As many rays as the design of this bandwidth fires; with one gate as many as fit."""
         if self.gates_per_ray:
             return self._chosen(max(one.rays for one in self.fired if one.mbps == limit_mbps), limit_mbps)
         widths_m = np.concatenate([np.diff(rays.gate_m[:1]) for rays in self._proposed])
-        fit = most_within(partial(bandwidth.mbps_of_widths, widths_m), limit_mbps * len(widths_m))
+        fit = most_within(partial(self.bandwidth.mbps_of_widths, widths_m), limit_mbps * len(widths_m))
         most = min(MOST_CHOSEN // len(widths_m), *(len(rays) for rays in self._proposed))
         return self._chosen(most if fit is None else min(fit, most), np.inf)
 
@@ -128,7 +159,8 @@ class GreedyCandidate:
                 # the least bandwidth of any design is one bin per ray
                 choice = choose(table.coverage, counts, price=1 / COARSE_SLACK)
         gate_m = table.gates_m[choice.rays, choice.gate[choice.rays]]
-        fired = replace(table.selection.rays.subset(choice.rays), gate_m=gate_m)
+        angles_rad = np.concatenate([rays.angles_rad for rays in self._proposed])[choice.rays]
+        fired = replace(table.selection.rays.subset(choice.rays), gate_m=gate_m, angles_rad=angles_rad)
         time_s = fire_times(count, self.bandwidth.rate_hz)
         # candidates are in the order of the values, and as many are chosen at each
         places = np.arange(count * values).reshape(values, count)
@@ -177,7 +209,7 @@ class GreedyCandidate:
 
         ends = np.cumsum([0, *map(len, self._proposed)]).tolist()
         visits = [slice(*pair) for pair in itertools.pairwise(ends)]
-        selection = Selection(Rays.joined(self._proposed), visits, self._gates, self.bandwidth, name=GREEDY)
+        selection = Selection(Rays.joined(self._proposed), visits, self._gates, self.bandwidth, name=GREEDY.name)
         informed = self.training.inform(CHOICE, selection.rays, visits, 0, self.scenes)
         gates_m = selection.gates(selection.rays, visits, informed)
         return _Table(selection, selection.coverage(informed, gates_m), gates_m)

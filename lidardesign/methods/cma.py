@@ -1,4 +1,4 @@
-"""The baseline `cma`: the first design with its sensors optimised directly, by N. Hansen's `cma`.
+"""The method `cma`: the first design with its sensors optimised directly, by N. Hansen's `cma`.
 
 A vector holds, sensor by sensor, the shift of its origin, of its boresight (azimuth, elevation, roll) and of its gates,
 and the logarithms by which its field of view and its gates are wider, as far as they are free, in steps that change a
@@ -12,17 +12,20 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
 from lidardesign.constraints.document import Constraints
 from lidardesign.constraints.feasibility import BandwidthBudget
 from lidardesign.constraints.origins import mounts_of
-from lidardesign.errors import BackgroundNote
+from lidardesign.errors import BackgroundNote, ConfigError
 from lidardesign.mixture.bounds import bounds_of
 from lidardesign.mixture.components import Axes
 from lidardesign.numerics import SLACK, TINY, sphere_exp, sphere_log, wrap_angle
+from lidardesign.problem.method import API_VERSION, DESIGN
+from lidardesign.problem.problem import DesignResult, Problem, ray_design
+from lidardesign.problem.world import World
 from lidardesign.rays.gates import admitted_gates
 from lidardesign.run.clock import phase
 from lidardesign.scenes.rays import Rays
@@ -200,21 +203,77 @@ class MovableSensors:
         varied = own[:, GATE].any(axis=1, keepdims=True)
         gate_m = np.where(varied, admitted_gates(gate_m, rows), rays.gate_m) if varied.any() else rays.gate_m
         looking = direction(azimuth, elevation)
-        return replace(rays, origin_m=rays.origin_m + own[:, ORIGIN], direction=looking, gate_m=gate_m, angles_rad=None)
+        angles_rad = np.stack([azimuth, elevation], axis=1)
+        place_m = rays.origin_m + own[:, ORIGIN]
+        return replace(rays, origin_m=place_m, direction=looking, gate_m=gate_m, angles_rad=angles_rad)
 
     def excess(self, positions: Positions) -> float:
         """The share by which the bandwidth of rays exceeds the design's; 0 where it does not."""
         return max(max(mean_mbps(positions, model) / limit - 1 - SLACK, 0.0) for model, limit in self._limits)
 
 
+class Cma:
+    """The method: see `Method`; every number of rays is a search of its own, whose record is in the provenance."""
+
+    name = CMA
+    summary = "direct optimisation of the first design's sensors on training scenes"
+    api_version = API_VERSION
+    needs = frozenset({DESIGN})
+    is_redrawn = False
+
+    def refuses(self, problem: Problem) -> str | None:
+        """See `Method`: a search starts from single patterns of the first design."""
+        starts = problem.compared.starts
+        return "" if starts and self._count(problem) not in starts else None
+
+    def design(self, problem: Problem) -> DesignResult | None:
+        """See `Method`.
+
+        Raises:
+            ConfigError: There is no design to begin with.
+        """
+        world, compared = problem.world, problem.compared
+        if not compared.designs:
+            raise ConfigError(
+                "there is no design whose sensors can be varied",
+                where=f"--baseline {CMA}",
+                allowed="at least one design",
+            )
+        found = world.known(self.name, lambda: self._search(problem)).found(self._count(problem))
+        return DesignResult(found)
+
+    def _count(self, problem: Problem) -> int:
+        limit, readout = problem.limit_mbps, problem.readout
+        within = [n for n, start in problem.compared.starts.items() if mean_mbps(start, readout) == limit]
+        return max(within, default=0) if problem.rays is None else problem.rays
+
+    def _search(self, problem: Problem) -> CmaSearch:
+        world, design = problem.world, problem.compared.designs[0]
+        middle = world.conditions[len(world.conditions) // 2]
+        return CmaSearch(
+            design=design,
+            starts=problem.compared.starts,
+            space=world.space.at({**middle, **design.at}) if world.space.conditioned else world.space,
+            world=world,
+            scorer=world.scorer(keeps_casters=True),
+            settings=problem.config or CmaSettings(),
+            seed=world.seed,
+            bandwidth=problem.readout,
+        )
+
+
+METHOD = Cma()
+
+
 @dataclass(eq=False)
-class CmaCandidate:
-    """The layout of the baseline `cma`; every number of rays is a search of its own.
+class CmaSearch:
+    """Searches for the sensors of a design, one for every number of rays.
 
     Arguments:
         design: Whose sensors are moved.
         starts: Its rays by their number.
         space: The design space at one condition value.
+        world: The world, whose conditions rays are fired at.
         scorer: Scores on training scenes.
         settings: Limits of each search.
         seed: Root of the random numbers.
@@ -226,24 +285,32 @@ class CmaCandidate:
     design: DesignSpec
     starts: Mapping[int, Positions]
     space: DesignSpace
+    world: World
     scorer: TrainingScorer
     settings: CmaSettings
     seed: int
     bandwidth: Bandwidth
-    name: str = CMA
-    drawn_anew: bool = False
     searches: dict[int, tuple[Positions, SearchRecord]] = field(default_factory=dict, init=False)
 
-    def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> Positions:
-        """See `lidardesign.scoring.baselines.candidates.Candidate`."""
+    def positions(self, count: int) -> Positions:
+        """The best rays that a search found, of this number."""
         if count not in self.searches:
             self.searches[count] = self._searched(count)
         return self.searches[count][0]
 
-    def positions_within(self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth) -> Positions:
-        """See `lidardesign.scoring.baselines.candidates.Candidate`: as many rays as the design of this bandwidth."""
-        of_limit = [n for n, start in self.starts.items() if mean_mbps(start, bandwidth) == limit_mbps]
-        return self.positions(spaces, max(of_limit))
+    def found(self, count: int) -> DesignSpec:
+        """The design of these rays, with the parts of the one that it began with."""
+        lists = self.positions(count)
+        origin = {"search": asdict(self.searches[count][1])}
+        if lists is self.starts[count]:
+            return replace(self.design, name=CMA, adaptive=None, provenance=origin)
+        made = ray_design(CMA, lists, self.world, origin)
+        used = np.unique(lists[0].sensor)
+        sensors = [
+            replace(sensor, name=own.name, part=own.part)
+            for sensor, own in zip(made.sensors, (self.design.sensors[number] for number in used), strict=True)
+        ]
+        return replace(made, sensors=tuple(sensors))
 
     @phase("cma")
     def _searched(self, count: int) -> tuple[Positions, SearchRecord]:

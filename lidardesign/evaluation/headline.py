@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from lidardesign.errors import ThresholdError
 from lidardesign.estimates import figure_and_interval
-from lidardesign.scoring.evaluation.results import BY_HAND, Evaluation, Paired, verdict
+from lidardesign.evaluation.results import BY_HAND, Evaluation, Paired, verdict
 
 
 def comparison(pair: Paired, better: str, unit: str) -> str:

@@ -1,4 +1,4 @@
-"""Training scenes as baselines see them: their returns, and the gates that hold these."""
+"""Training scenes as methods see them: their returns, and the gates that hold these."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from lidardesign.numerics import wrap_turn
+from lidardesign.problem.world import World
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.scene import Scene
-from lidardesign.scoring.baselines.candidates import opened_gate, whole_range
 from lidardesign.sensors.pattern import low_discrepancy
 from lidardesign.space import AZIMUTH, ELEVATION, FULL_TURN, RANGE, DesignSpace, direction
 
@@ -23,6 +23,19 @@ MOST_VIEWS = 128  # scenes times frames that are looked at: evenly spread where 
 
 
 FLATTEST_COSINE = 0.1  # a surface counts as seen no more flatly
+# A gate without width receives nothing, since gates are open at their end. Ranges that never vary get the width
+# of the default 100 ps bin around them.
+SMALLEST_GATE_M = 0.015
+
+
+def opened_gate(start_m: float | np.ndarray, end_m: float | np.ndarray) -> np.ndarray:
+    """Gates that include both their ends, shape (..., 2) [m]; those without width get `SMALLEST_GATE_M`."""
+    start, end = np.asarray(start_m, dtype=np.float64), np.asarray(end_m, dtype=np.float64)
+    around = np.maximum(0.0, start - SMALLEST_GATE_M / 2)
+    wide = end > start
+    return np.stack(
+        [np.where(wide, start, around), np.where(wide, np.nextafter(end, np.inf), around + SMALLEST_GATE_M)], axis=-1
+    )
 
 
 class ReturnTable:
@@ -118,7 +131,7 @@ def _features(points: np.ndarray, scale: tuple[float, float]) -> np.ndarray:
     return np.column_stack([looking / scale[0], points[:, :3] / scale[1]])
 
 
-class TrainingViews:
+class TrainingReturns:
     """The training scenes at up to `MOST_VIEWS` of their frames, evenly spread over scenes and time.
 
     Arguments:
@@ -188,3 +201,13 @@ def unrolled(azimuth_rad: np.ndarray) -> np.ndarray:
     turned = np.sort(wrap_turn(azimuth_rad))
     gaps = np.diff(np.append(turned, turned[0] + FULL_TURN))
     return wrap_turn(azimuth_rad, turned[(int(np.argmax(gaps)) + 1) % len(turned)])
+
+
+def whole_range(space: DesignSpace) -> np.ndarray:
+    """The gate over all of a space's range, shape (2,) [m]."""
+    return opened_gate(space.low[RANGE], space.high[RANGE])
+
+
+def returns_of(world: World) -> TrainingReturns:
+    """The training scenes of a world, traced once for all methods."""
+    return world.known("returns", lambda: TrainingReturns(world.space, world.learned))

@@ -26,7 +26,7 @@ from lidardesign.density.objective.target import PADDING_SIGMAS, Target, build_t
 from lidardesign.density.objective.visibility import Columns, NoVisibility, Optics, RayBatch, Unmoved, Visibility
 from lidardesign.numerics import logsumexp
 from lidardesign.scenes.scene import Body, Mesh, Scene, inverse_rigid
-from lidardesign.scoring.accuracy.probes import AccuracyRequest, Probes, density_sweep, draw_probes, few_columns
+from lidardesign.evaluation.accuracy.probes import AccuracyRequest, Probes, density_sweep, draw_probes, few_columns
 from lidardesign.scoring.sweep import Measurement, Sweep, timed
 from lidardesign.space import DesignSpace
 

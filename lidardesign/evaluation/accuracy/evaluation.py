@@ -19,10 +19,10 @@ from lidardesign.run.clock import Progress, phase
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import path_windows
 from lidardesign.scenes.scene import Scene
-from lidardesign.scoring.accuracy import fields, training
-from lidardesign.scoring.accuracy.probes import AccuracyRequest
-from lidardesign.scoring.evaluation.request import EvaluationRequest, numbers_fired
-from lidardesign.scoring.evaluation.results import Row
+from lidardesign.evaluation.accuracy import fields, training
+from lidardesign.evaluation.accuracy.probes import AccuracyRequest
+from lidardesign.evaluation.request import EvaluationRequest, numbers_fired
+from lidardesign.evaluation.results import Row
 from lidardesign.scoring.fired import Positions, fired
 from lidardesign.scoring.scene_scores import score_lists
 from lidardesign.scoring.sweep import Accuracy, Measurement, Sweep, timed, with_memory

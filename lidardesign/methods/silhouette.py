@@ -1,4 +1,4 @@
-"""The baselines `silhouette` and `lloyd`: rays and gates from returns of dense rays in training scenes.
+"""The methods `silhouette` and `lloyd`: rays and gates from returns of dense rays in training scenes.
 
 `silhouette` lays a hexagonal lattice over all directions in which at least 1 % of the training scenes and frames return
 on a target; its spacing is such that exactly as many rays as asked for fall inside (of a few more those that return
@@ -25,9 +25,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from lidardesign.numerics import TINY, unit_vectors
-from lidardesign.scoring.baselines.candidates import BaselineLayout, LayoutSite
-from lidardesign.scoring.baselines.even import SIXTH, SphereField, box_crop, even_placement, widened_angles
-from lidardesign.scoring.baselines.views import RAY_AXES, ReturnTable, TrainingViews, dense_rays
+from lidardesign.methods.bounding import box_crop
+from lidardesign.methods.fields import SIXTH, SphereField, even_placement, widened_angles
+from lidardesign.methods.laid_out import LaidOut, Layout, Site
+from lidardesign.methods.returns import RAY_AXES, ReturnTable, TrainingReturns, dense_rays, returns_of
 from lidardesign.sensors.pattern import low_discrepancy
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, angles, direction
 
@@ -57,7 +58,7 @@ class Survey(NamedTuple):
         return np.flatnonzero(self.table.share >= LEAST_SHARE)
 
 
-def survey(views: TrainingViews, space: DesignSpace) -> Survey | None:
+def survey(views: TrainingReturns, space: DesignSpace) -> Survey | None:
     """Returns of dense rays from the middle of a space's origins, over a widened crop of the returns; None without."""
     middle = (np.array(space.low) + np.array(space.high)) / 2
     low, high = np.array(space.low), np.array(space.high)
@@ -78,23 +79,13 @@ def survey(views: TrainingViews, space: DesignSpace) -> Survey | None:
 PlaceRays = Callable[[Survey, int], np.ndarray]
 
 
-def silhouette(views: TrainingViews) -> list[BaselineLayout]:
-    """The layout; none where dense rays return nothing."""
-    return _layouts("silhouette", views, lattice_rays, 0.0, SILHOUETTE_SIGMAS)
-
-
-def lloyd(views: TrainingViews) -> list[BaselineLayout]:
-    """The layout; none where dense rays return nothing."""
-    return _layouts("lloyd", views, _lloyd_rays, LLOYD_TAIL, LLOYD_SIGMAS)
-
-
-def _layouts(name: str, views: TrainingViews, place: PlaceRays, tail: float, sigmas: float) -> list[BaselineLayout]:
+def _layouts(name: str, views: TrainingReturns, place: PlaceRays, tail: float, sigmas: float) -> list[Layout]:
     survey_at = cache(partial(survey, views))
     everywhere = survey_at(views.space)
     if everywhere is None:
         return []
 
-    def lay_out(count: int, site: LayoutSite) -> tuple[np.ndarray, np.ndarray]:
+    def lay_out(count: int, site: Site) -> tuple[np.ndarray, np.ndarray]:
         found = survey_at(site.space) or everywhere
         points = place(found, count)
         gates = found.table.gates(points, tail, sigmas * found.table.sigma_m)
@@ -102,7 +93,7 @@ def _layouts(name: str, views: TrainingViews, place: PlaceRays, tail: float, sig
             points[:, axis] = np.clip(points[:, axis], site.space.low[axis], site.space.high[axis])
         return points, gates
 
-    return [BaselineLayout(name, lay_out)]
+    return [Layout(name, lay_out)]
 
 
 def lattice_rays(found: Survey, count: int) -> np.ndarray:
@@ -178,3 +169,17 @@ def _fine_points(found: Survey, count: int) -> tuple[np.ndarray, np.ndarray]:
     points = np.tile(found.low, (count, 1))
     points[:, free] += unit[:, 1:] * (found.high - found.low)[free]
     return points, unit[:, 0]
+
+
+SILHOUETTE = LaidOut(
+    "silhouette",
+    "a lattice over all directions in which training scenes return",
+    lambda problem: _layouts(
+        "silhouette", returns_of(problem.world), lattice_rays, tail=0.0, sigmas=SILHOUETTE_SIGMAS
+    ),
+)
+LLOYD = LaidOut(
+    "lloyd",
+    "like silhouette, denser where returns are frequent and surfaces large",
+    lambda problem: _layouts("lloyd", returns_of(problem.world), _lloyd_rays, tail=LLOYD_TAIL, sigmas=LLOYD_SIGMAS),
+)

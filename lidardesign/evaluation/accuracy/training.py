@@ -18,7 +18,7 @@ from lidardesign.density.training.learned import (
     noise_shares,
     remeasured,
 )
-from lidardesign.scoring.accuracy.probes import AccuracyRequest, density_sweep
+from lidardesign.evaluation.accuracy.probes import AccuracyRequest, density_sweep
 from lidardesign.scoring.sweep import Measurement, Sweep, timed
 from lidardesign.task import random_generator
 

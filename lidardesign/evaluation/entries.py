@@ -13,25 +13,17 @@ from typing import Any
 
 import numpy as np
 
-from lidardesign.rays.proposals import CANDIDATES_PER_RAY
+from lidardesign.evaluation.request import EvaluationRequest, numbers_fired
+from lidardesign.methods.cma import SearchRecord
 from lidardesign.rays.training_scenes import HELD_BACK
 from lidardesign.run.clock import phase
-from lidardesign.scoring.baselines import cma
-from lidardesign.scoring.baselines.candidates import Candidate
-from lidardesign.scoring.baselines.greedy import GREEDY, USUAL_SCENES, Fired, GreedyCandidate, greedy_rays
-from lidardesign.scoring.baselines.simple import Baselines, Option, TwinCandidate
-from lidardesign.scoring.baselines.views import TrainingViews
-from lidardesign.scoring.evaluation.request import EvaluationRequest, fired_numbers, numbers_fired
 from lidardesign.scoring.fired import ONE_DEVICE, Devices, Positions, assign_devices, fired
-from lidardesign.sensors.adaptive import AdaptiveRays, mean_mbps
+from lidardesign.sensors.adaptive import mean_mbps
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.simulate.detector.physics import EFFECTS
 from lidardesign.simulate.plan import Choice, EffectPlan, Tolerance
 
-# Candidates of a baseline are compared on this many training scenes: enough to tell a good layout from a bad one,
-# at a fraction of the held-out scenes' cost.
-JUDGED_SCENES = 8
 # The strongest baseline is found on training scenes that no baseline's rays were chosen on: picking the best
 # of several by their scores on held-out scenes would favour a lucky one.
 MOST_BASELINE_SCENES = 20
@@ -61,7 +53,7 @@ class Entry:
     redraw: Callable[[int], Positions] | None = None
     matched_to: str | None = None
     matched_rays: int | None = None
-    search: cma.SearchRecord | None = None
+    search: SearchRecord | None = None
     devices: Devices = ONE_DEVICE
 
     @property
@@ -96,77 +88,18 @@ class Entry:
 
 
 @phase("rays")
-def entries_of(request: EvaluationRequest) -> list[Entry]:
-    """All entries: designs at the numbers of rays that they can fire, baselines, then those at each one's bandwidth.
+def design_entries(request: EvaluationRequest, counts: Sequence[int]) -> list[Entry]:
+    """The entries of designs at those numbers of rays that they can fire.
 
     Raises:
-        ConfigError: No design can fire any of the numbers of rays, or its rays end before where it is evaluated.
+        ConfigError: The rays of a design end before where it is evaluated.
     """
-    counts = fired_numbers(request.designs, request.rays)
-    designs = [
+    return [
         entry
         for design in request.designs
         for count in numbers_fired(design, counts, request.alone)
         for entry in _of_design(request, design, count)
     ]
-    shared = [count for count in counts if count not in request.alone]
-    choosable = [] if request.training is None else greedy_rays(request.task, len(request.conditions), shared)[0]
-    # a search starts from single patterns of the first design
-    named = (request.designs[0].name, f"{request.designs[0].name}{SINGLE}") if request.designs else ()
-    searched = [one for one in designs if one.name in named and not isinstance(one.positions, AdaptiveRays)]
-    starts = {one.rays: one.positions for one in searched}
-    # beside several designs a baseline has as many devices as the one with the most
-    devices = max((Devices.of(one.positions) for one in designs), key=lambda one: one.number, default=ONE_DEVICE)
-    compared = [Fired(entry.rays, entry.mbps(request.bandwidth)) for entry in designs]
-    refit = request.without_visibility
-    baselines = Baselines(
-        request.space,
-        request.train,
-        request.seed,
-        partial(_judge, request, devices),
-        conditions=request.conditions,
-        gates_per_ray=any(design.has_gates_per_ray for design in request.designs),
-        without_visibility=refit and partial(TwinCandidate, refit, request.conditions, compared),
-        optimised=partial(_optimised, request, starts) if request.designs else None,
-        chosen=partial(_chosen, request, compared, max(choosable, default=0)),
-    )
-    wanted: list[tuple[str, list[Option], Entry | None]] = [
-        (name, baselines.options(name, count), None)
-        for name in request.baselines
-        for count in shared
-        if name != GREEDY or count in choosable
-        if name != cma.CMA or count in starts or not starts
-    ]
-    if request.equal_bandwidth:
-        wanted += [
-            (name, baselines.options_within(name, entry.mbps(request.bandwidth), request.bandwidth), entry)
-            for entry in designs
-            if entry.rays in shared
-            for name in request.baselines
-            if name != cma.CMA or entry in searched
-            if name != GREEDY or entry.rays in choosable
-        ]
-    wanted = [one for one in wanted if one[1]]
-    chosen = baselines.best([(name, options) for name, options, _ in wanted])
-    return designs + [
-        _entry(baselines, name, option, matched, devices if matched is None else Devices.of(matched.positions))
-        for (name, _, matched), option in zip(wanted, chosen, strict=True)
-    ]
-
-
-def _entry(baselines: Baselines, name: str, option: Option, matched: Entry | None, devices: Devices) -> Entry:
-    candidate, count = option.candidate, len(option.positions[0])
-    searched = matched is None and isinstance(candidate, cma.CmaCandidate)
-    return Entry(
-        name,
-        option.positions,
-        baseline=True,
-        redraw=partial(candidate.positions, baselines.spaces, count) if candidate.drawn_anew else None,
-        matched_to=None if matched is None else matched.name,
-        matched_rays=None if matched is None else matched.rays,
-        search=candidate.searches[count][1] if searched else None,
-        devices=devices,
-    )
 
 
 def _of_design(request: EvaluationRequest, design: DesignSpec, count: int) -> list[Entry]:
@@ -176,42 +109,6 @@ def _of_design(request: EvaluationRequest, design: DesignSpec, count: int) -> li
     if design.following(count) is None:
         return [fixed]
     return [replace(fixed, positions=rays_of(request.task)), replace(fixed, name=f"{design.name}{SINGLE}")]
-
-
-def _optimised(request: EvaluationRequest, starts: Mapping[int, Positions]) -> Candidate:
-    design, space, conditions = request.designs[0], request.space, request.conditions
-    middle = conditions[len(conditions) // 2]
-    return cma.CmaCandidate(
-        design=design,
-        starts=starts,
-        space=space.at({**middle, **design.at}) if space.conditioned else space,
-        scorer=request.scorer(request.train, keeps_casters=True),
-        settings=request.cma,
-        seed=request.seed,
-        bandwidth=request.bandwidth,
-    )
-
-
-def _chosen(request: EvaluationRequest, compared: Sequence[Fired], most: int, views: TrainingViews) -> Candidate:
-    numbers = [one["scenes"] for design in request.designs for one in design.certificates]
-    return GreedyCandidate(
-        views=views,
-        spaces=[request.space.at(condition) for condition in request.conditions],
-        training=request.training,
-        scenes=max(numbers, default=USUAL_SCENES),
-        gates_per_ray=any(design.has_gates_per_ray for design in request.designs),
-        candidates=CANDIDATES_PER_RAY * most,
-        fired=compared,
-        bandwidth=request.bandwidth,
-    )
-
-
-def _judge(request: EvaluationRequest, devices: Devices, lists: Sequence[Positions]) -> list[float]:
-    """The mean score of sets of rays on a few training scenes, turned so that lower is better."""
-    if not request.train:
-        return [0.0] * len(lists)
-    assigned = [assign_devices(positions, devices) for positions in lists]
-    return (request.metric.sign * request.scorer(request.train).scores(assigned, JUDGED_SCENES).mean(axis=0)).tolist()
 
 
 @phase("strongest baseline")

@@ -26,8 +26,8 @@ from lidardesign.estimates import (
     spanned,
     student_interval,
 )
-from lidardesign.scoring.evaluation.entries import mean_baseline
-from lidardesign.scoring.evaluation.results import Evaluation, Mounting, Paired, Row
+from lidardesign.evaluation.entries import mean_baseline
+from lidardesign.evaluation.results import Evaluation, Mounting, Paired, Row
 from lidardesign.task import Metric
 
 # Design, rays, and what the bandwidth is matched to; rays at equal bandwidth differ between seeds.
