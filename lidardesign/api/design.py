@@ -18,7 +18,7 @@ from lidardesign.api.export import (
     Exported,
     ExportRequest,
     export_target,
-    exporter_of,
+    format_of,
 )
 from lidardesign.constraints.document import Constraints
 from lidardesign.errors import ConfigError, DataError, check_number, names_arguments, pasted
@@ -254,9 +254,9 @@ class Design(DesignSource):
             notes: Called with every note.
         """
         out = None if path is None else Path(path)
-        exporter = exporter_of(format, out)
-        target = export_target(self.path, out, exporter)
-        return ExportRequest(self, exporter, target, rays, at or {}, rate_hz, robot).write(notes=notes)
+        chosen = format_of(format, out)
+        target = export_target(self.path, out, chosen.suffix)
+        return ExportRequest(self, chosen, target, rays, at or {}, rate_hz, robot).write(notes=notes)
 
     @names_arguments
     def simulate(

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lidardesign.errors import PluginError
-from lidardesign.registry import plugin_method
+from lidardesign.plugins import plugin_method
 from lidardesign.run.clock import Progress, phase
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import Rays, Returns

@@ -23,7 +23,7 @@ from lidardesign.constraints.origins import SAME_PLACE_M, place_text
 from lidardesign.errors import BackgroundNote, ConfigError, LidardesignError
 from lidardesign.estimates import Interval, figure_and_interval
 from lidardesign.fitting.options import FitOptions
-from lidardesign.formats.registry import EXPORTERS
+from lidardesign.formats import FORMATS
 from lidardesign.parts.catalogue import load_library
 from lidardesign.report.figures import OUTCOME_WORDS
 from lidardesign.run.manifest import locked_run, write_recorded
@@ -420,7 +420,7 @@ class Studio:
         self._server.send_file_download(f"{page.parent.name}.html", page.read_bytes())
 
     def _on_export(self, value: Any) -> None:
-        if value in EXPORTERS:
+        if value in FORMATS.names():
             self._exported(value)
 
     def _exported(self, name: str) -> Path:

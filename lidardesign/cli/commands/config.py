@@ -41,7 +41,7 @@ def init(
         _check_new(out)
         with phase("libraries"):
             from lidardesign.api.config_reference import config_template
-            from lidardesign.registry import load_task
+            from lidardesign.task import load_task
 
         plugin = load_task(task)
         document, text = config_template(plugin, preset=preset, overrides=overrides or (), seed=seed)
@@ -70,7 +70,7 @@ def schema(
     with command(json=json, quiet=quiet) as output:
         with phase("libraries"):
             from lidardesign.api.config_reference import SCHEMA_KINDS, schema_of
-            from lidardesign.registry import load_task
+            from lidardesign.task import load_task
 
         check_choice(kind, "KIND", SCHEMA_KINDS)
         if task is not None and kind != "config":

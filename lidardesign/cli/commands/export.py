@@ -1,4 +1,4 @@
-"""`lidardesign export`: write a design for other programs."""
+"""`lidardesign export`: write a design for other programs; `lidardesign formats`: the formats that it can take."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from lidardesign.cli.commands.tasks import Seconds, list_plugins, try_laws
 from lidardesign.cli.terminal import options
 from lidardesign.cli.terminal.grids import RichConsole, text_table
 from lidardesign.cli.terminal.options import formats
@@ -68,28 +69,28 @@ def export(
 ) -> None:
     """Write a design in another program's format."""
     with command(json=json, quiet=quiet, verbose=verbose) as output:
+        if list_formats:
+            return _list(output)
         with phase("libraries"):
             from lidardesign.api.export import (
                 DesignSource,
                 ExportRequest,
                 export_target,
-                exporter_of,
+                format_of,
             )
             from lidardesign.formats.designs import read_design
 
-        if list_formats:
-            return _list(output)
         place = options.parse_at(at)
         if design is None:
             raise ConfigError("no design was given", where="DESIGN", hint="lidardesign export --list shows the formats")
-        exporter = exporter_of(format_)
+        chosen = format_of(format_)
         source = DesignSource(read_design(design, output.remark), path=design)
-        target = export_target(design, out, exporter)
-        request = ExportRequest(source, exporter, target, rays, place, rate_hz, robot=robot)
+        target = export_target(design, out, chosen.suffix)
+        request = ExportRequest(source, chosen, target, rays, place, rate_hz, robot=robot)
         announce([target], output)
-        check_outputs({"--out": target}, [robot] if robot else [], ("--out",) if exporter.folder else ())
+        check_outputs({"--out": target}, [robot] if robot else [], ("--out",) if chosen.is_folder else ())
         notes: list[str] = []
-        with written_file(target, exporter.suffix) as file:
+        with written_file(target, chosen.suffix) as file:
             exported = request.write(file, notes.append)
         for note in notes:
             if output.verbose or note not in exported.notes:
@@ -109,11 +110,39 @@ def export(
         output.result(document, show, files={"wrote": target} if output.quiet else None, says_time=True)
 
 
-def _list(output: Output) -> None:
-    from lidardesign.formats.registry import EXPORTERS
+formats_app = typer.Typer(help="List, show or check formats of exports.", no_args_is_help=True)
+FormatName = Annotated[str, typer.Argument(metavar="NAME", help="Name of a format.", autocompletion=formats)]
 
-    keys = ("suffix", "summary", "reader", "checked", "folder")
-    formats = [{"name": name, **{key: getattr(exporter, key) for key in keys}} for name, exporter in EXPORTERS.items()]
-    headings = ("format", "suffix", "what it is", "for", "how that is checked")
-    rows = [[entry[key] for key in ("name", *keys[:-1])] for entry in formats]
-    output.result({"formats": formats}, lambda rich: rich.print(text_table(headings, rows)), show_costs=False)
+
+@formats_app.command("list")
+def list_(json: options.Json = False, quiet: options.Quiet = False) -> None:
+    """List the installed formats; a broken one with its reason."""
+    with command(json=json, quiet=quiet) as output:
+        _list(output)
+
+
+def _list(output: Output) -> None:
+    from lidardesign.formats import FORMATS
+
+    shown = {"format": "name", "suffix": "suffix", "what it is": "summary", "for": "reader"}
+    list_plugins(FORMATS, {**shown, "how that is checked": "checked"}, output)
+
+
+@formats_app.command("show")
+def show(name: FormatName, json: options.Json = False, quiet: options.Quiet = False) -> None:
+    """Show a format: what it is, who reads it, and what it holds."""
+    with command(json=json, quiet=quiet) as output:
+        from lidardesign.formats import FORMATS
+
+        facts = {"name": name, **FORMATS.loaded(name)[1], "distribution": FORMATS.distribution_of(name)}
+        rows = [(key, ", ".join(fact) if isinstance(fact, list) else str(fact)) for key, fact in facts.items()]
+        output.result(facts, lambda rich: rich.print(text_table(("", ""), rows)), show_costs=False)
+
+
+@formats_app.command("check")
+def check(name: FormatName, seconds: Seconds = 60.0, json: options.Json = False, quiet: options.Quiet = False) -> None:
+    """Check that a format keeps the contract. Every law is tried; exit 6 where one does not hold."""
+    with command(json=json, quiet=quiet) as output:
+        from lidardesign.contract.process import CheckRequest
+
+        try_laws(CheckRequest(name, limit_s=seconds, noun="format"), output)

@@ -4,17 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from lidardesign.cli.terminal import options
 from lidardesign.cli.terminal.grids import RichConsole, text_table
-from lidardesign.cli.terminal.output import command
+from lidardesign.cli.terminal.output import Output, command
 from lidardesign.errors import pasted
 from lidardesign.run.clock import phase
 
+if TYPE_CHECKING:
+    from lidardesign.contract.process import CheckRequest
+    from lidardesign.plugins import PluginKind
+
 OUTCOMES = {"pass": ("pass", "green"), "fail": ("FAIL", "bold red"), "skip": ("skip", "dim")}
+SECONDS = typer.Option("--seconds", metavar="S", min=0.1, max=86_400, help="Longest time that one call may take.")
+Seconds = Annotated[float, SECONDS]
 
 tasks_app = typer.Typer(help="List, show, check or start tasks.", invoke_without_command=True)
 
@@ -34,27 +40,24 @@ def list_(
     """List the installed tasks; a broken one with its reason."""
     with command(json=json, quiet=quiet) as output:
         with phase("libraries"):
-            from lidardesign.registry import list_tasks
+            from lidardesign.task import TASKS
 
-        entries = [
-            {"name": item.name, "summary": item.summary, "distribution": item.distribution, "error": item.error}
-            for item in list_tasks()
-        ]
-        output.result({"tasks": entries}, lambda rich: _show_list(entries, rich), show_costs=False)
+        list_plugins(TASKS, {"task": "name", "what it is": "summary", "from": "distribution"}, output)
 
 
-def _show_list(entries: list[dict[str, Any]], rich: RichConsole) -> None:
+def list_plugins(kind: PluginKind[Any], shown: Mapping[str, str], output: Output) -> None:
+    """Print all plugins of a kind; of a broken one its reason. A table shows some facts below headings."""
     from rich.text import Text
 
-    rows = [
-        (
-            item["name"],
-            Text.assemble(("broken:", "red"), f" {item['error']}") if item["error"] else item["summary"],
-            item["distribution"],
-        )
-        for item in entries
+    entries: list[dict[str, Any]] = [
+        {"name": one.name, "summary": "", **one.facts, "distribution": one.distribution, "error": one.error}
+        for one in kind.listings()
     ]
-    rich.print(text_table(("task", "what it is", "from"), rows))
+    rows = []
+    for one in entries:
+        summary = Text.assemble(("broken:", "red"), f" {one['error']}") if one["error"] else one["summary"]
+        rows.append([{**one, "summary": summary}.get(key, "") for key in shown.values()])
+    output.result({f"{kind.noun}s": entries}, lambda rich: rich.print(text_table([*shown], rows)), show_costs=False)
 
 
 @tasks_app.command("show")
@@ -67,7 +70,7 @@ def show(
     with command(json=json, quiet=quiet) as output:
         with phase("libraries"):
             from lidardesign.api.config_reference import describe_task
-            from lidardesign.registry import load_task
+            from lidardesign.task import load_task
 
         document = describe_task(load_task(name))
         output.result(document, lambda rich: _show_task(document, rich), show_costs=False)
@@ -120,10 +123,7 @@ def check(
     ],
     config: options.ConfigFile = None,
     overrides: options.Overrides = None,
-    seconds: Annotated[
-        float,
-        typer.Option("--seconds", metavar="S", min=0.1, max=86_400, help="Longest time that one call may take."),
-    ] = 60.0,
+    seconds: Seconds = 60.0,
     seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -131,29 +131,37 @@ def check(
     """Check that a task keeps the contract. Every law is tried; exit 6 where one does not hold."""
     with command(json=json, quiet=quiet) as output:
         with phase("libraries"):
-            from lidardesign.contract.contract import LAWS, refuse_broken
-            from lidardesign.contract.process import CheckRequest, check_in_process
+            from lidardesign.contract.process import CheckRequest
 
-        findings = []
-        with output.progress("contract") as progress, phase("contract"):
-            for finding in check_in_process(CheckRequest(name, config, tuple(overrides or ()), seed, seconds)):
-                findings.append(finding)
-                progress.show(len(findings), len(LAWS) + 1, detail=finding.law)
-        counts = {outcome: sum(finding.outcome == outcome for finding in findings) for outcome in OUTCOMES}
-        document = {
-            "task": name,
-            "keeps": not counts["fail"],
-            **counts,
-            "laws": [finding.as_dict() for finding in findings],
-        }
-        output.result(document, lambda rich: _show_laws(document, rich))
-        refuse_broken(name, findings)
+        try_laws(CheckRequest(name, config, tuple(overrides or ()), seed, seconds), output)
 
 
-def _show_laws(document: Mapping[str, Any], rich: RichConsole) -> None:
+def try_laws(request: CheckRequest, output: Output) -> None:
+    """Try a plugin's contract and print the findings.
+
+    Raises:
+        BrokenLawError: A law does not hold.
+    """
+    with phase("libraries"):
+        from lidardesign.contract.contract import refuse_broken
+        from lidardesign.contract.process import check_in_process, statements_of
+
+    findings, where = [], f"{request.noun} {request.name}"
+    with output.progress("contract") as progress, phase("contract"):
+        for finding in check_in_process(request):
+            findings.append(finding)
+            progress.show(len(findings), len(statements_of(request.noun)), detail=finding.law)
+    counts = {outcome: sum(finding.outcome == outcome for finding in findings) for outcome in OUTCOMES}
+    laws = [finding.as_dict() for finding in findings]
+    document = {request.noun: request.name, "keeps": not counts["fail"], **counts, "laws": laws}
+    output.result(document, lambda rich: _show_laws(where, document, rich))
+    refuse_broken(where, findings)
+
+
+def _show_laws(title: str, document: Mapping[str, Any], rich: RichConsole) -> None:
     from rich.text import Text
 
-    table = text_table(("law", "", "what was found"), title=f"task {document['task']}")
+    table = text_table(("law", "", "what was found"), title=title)
     group = ""
     for law in document["laws"]:
         if group and law["group"] != group:

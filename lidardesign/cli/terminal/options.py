@@ -26,16 +26,18 @@ def words(metavar: str) -> Callable[[], list[str]]:
 
 def tasks() -> list[str]:
     """Installed tasks; none of them is imported."""
+    return _plugins("lidardesign.tasks")
+
+
+def formats() -> list[str]:
+    """Installed formats of exports; none of them is imported."""
+    return _plugins("lidardesign.formats")
+
+
+def _plugins(group: str) -> list[str]:
     from importlib.metadata import entry_points
 
-    return sorted({entry.name for entry in entry_points(group="lidardesign.tasks")})
-
-
-def formats() -> list[tuple[str, str]]:
-    """Formats of exports with their summaries."""
-    from lidardesign.formats.registry import EXPORTERS
-
-    return [(name, exporter.summary) for name, exporter in EXPORTERS.items()]
+    return sorted({entry.name for entry in entry_points(group=group)})
 
 
 def parts() -> list[str]:
@@ -51,7 +53,7 @@ def detectors() -> list[str]:
 def configuration_keys(context: typer.Context) -> list[tuple[str, str]]:
     """Keys of the configuration of the task that is on the command line."""
     from lidardesign.config import DensitySettings, LearningSettings
-    from lidardesign.registry import load_task
+    from lidardesign.task import load_task
 
     # typer leaves arguments in args while the last option waits for its value
     name = context.params.get("task") or context.params.get("name") or context.args[0]

@@ -15,7 +15,7 @@ import numpy as np
 
 from lidardesign.errors import ConfigError
 from lidardesign.estimates import mean_interval
-from lidardesign.registry import plugin_guard
+from lidardesign.plugins import plugin_guard
 from lidardesign.run.clock import Progress, phase
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import path_windows

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from lidardesign.errors import ConfigError
+from lidardesign.plugins import plugin_guard
 from lidardesign.rays.proposals import CANDIDATES_PER_RAY
 from lidardesign.rays.training_scenes import HELD_BACK
-from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.scoring.baselines import cma
 from lidardesign.scoring.baselines.candidates import Candidate

@@ -13,9 +13,9 @@ from functools import cached_property
 from typing import Any
 
 from lidardesign.errors import ConfigError, PluginError
+from lidardesign.plugins import plugin_guard
 from lidardesign.rays.information import features_of
 from lidardesign.rays.training_scenes import TrainingScenes
-from lidardesign.registry import plugin_guard
 from lidardesign.samples import Samples
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Scene

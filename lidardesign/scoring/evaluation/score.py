@@ -27,7 +27,7 @@ from lidardesign.estimates import (
     worst_tenth,
 )
 from lidardesign.numerics import ROUNDING
-from lidardesign.registry import plugin_guard
+from lidardesign.plugins import plugin_guard
 from lidardesign.run.clock import Progress, phase
 from lidardesign.scenes.scene import Scene, group_numbers
 from lidardesign.scenes.triangles import SecondCasts
