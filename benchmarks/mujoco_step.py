@@ -22,7 +22,7 @@ def models(options: Any, folder: Path) -> dict[str, Any]:
     """The compiled models by what they are: without rays, firing at every step, and at the frame rate."""
     import mujoco
 
-    from lidardesign.formats.registry import EXPORTERS
+    from lidardesign.formats import FORMATS, write_design
     from lidardesign.parts.catalogue import Pose, find_part, part_design
 
     generator = np.random.default_rng(0)
@@ -37,7 +37,7 @@ def models(options: Any, folder: Path) -> dict[str, Any]:
         include = ""
         if rate_hz is not None:
             file = folder / f"{name.replace(' ', '-')}.xml"
-            EXPORTERS["mjcf"].write(design, design.rays(), file, rate_hz)
+            write_design(FORMATS.load("mjcf"), design, design.rays(), file, rate_hz)
             include = f'<include file="{file.name}"/>'
         world = folder / f"world-{name.replace(' ', '-')}.xml"
         floor = '<geom type="plane" size="9 9 .1"/>'

@@ -82,9 +82,9 @@ def rays_needed(rays: Sequence[int], distance_m: Sequence[float], reached_m: flo
 
 def curves(run: Any, samples: Callable[[], Any], kind: str, counts: Sequence[int], seed: int) -> tuple[Curve, Curve]:
     """Of designs fitted with a seed, and of their twins, which are fitted to other samples."""
-    from lidardesign.fitting.fit import TWIN_NAME, twin_without_visibility
     from lidardesign.evaluation.request import EvaluationRequest
     from lidardesign.evaluation.score import evaluate
+    from lidardesign.fitting.fit import TWIN_NAME, twin_without_visibility
 
     started, rows = time.perf_counter(), []
     config, name = run.config, f"benchmark-{kind}"

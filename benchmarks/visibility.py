@@ -18,9 +18,9 @@ from common import face_scenes, interleaved, model_option, parser, report
 
 from lidardesign.config import DensitySettings
 from lidardesign.density.objective.visibility import NoVisibility
-from lidardesign.scenes.scene import Body, Box, Scene, rigid
 from lidardesign.evaluation.accuracy.fields import VisibilityCase
 from lidardesign.evaluation.accuracy.probes import Probes
+from lidardesign.scenes.scene import Body, Box, Scene, rigid
 from lidardesign.space import DesignSpace
 
 PLATE_M = 0.005

@@ -25,12 +25,12 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from lidardesign import open_run
+from lidardesign.evaluation.captures.capture import Capture, load_capture
 from lidardesign.formats.galvo import SPEED_OF_LIGHT_M_PER_PS, degree_frame, read_galvo, scan_directions
 from lidardesign.run.files import write_atomic
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Mesh, Scene
-from lidardesign.evaluation.captures.capture import Capture, load_capture
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.detector.physics import FWHM_PER_SIGMA, Detector, Physics
 from lidardesign.simulate.returns import photon_histograms

@@ -18,13 +18,13 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 from lidardesign.errors import ConfigError
 from lidardesign.limits import MAX_SEED
 from lidardesign.numerics import COARSE_SLACK
-from lidardesign.registry import UnknownTaskError, load_task, plugin_guard
+from lidardesign.plugins import UnknownPluginError, plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.run.manifest import read_manifest, verify, write_recorded
 from lidardesign.run.validation import Override, apply_override, check_model, is_name, keep_texts, parse_overrides
 from lidardesign.run.yaml import Document, KeyPath, dump_yaml, leaves, load_yaml, merged
 from lidardesign.space import DIMENSIONS, FARTHEST_M, SHORTEST_M, DesignSpace
-from lidardesign.task import Task, TaskConfig, moved_files
+from lidardesign.task import Task, TaskConfig, load_task, moved_files
 
 Visibility = Literal["auto", "raycast", "quadrature", "off"]
 Preset = Literal["draft", "standard", "fine"]
@@ -292,10 +292,10 @@ def load_run_config(run: Path) -> tuple[Task, RunConfig]:
     document = load_yaml(run / FILE_NAME)
     try:
         return config_of(document)
-    except UnknownTaskError as error:
+    except UnknownPluginError as error:
         plugin = read_manifest(run).get("plugin")
         package, _, version = plugin.partition(" ") if is_name(plugin) else ("", "", "")
-        raise UnknownTaskError(
+        raise UnknownPluginError(
             f"the task {document.mapping.get('task_name')!r} of this run is not installed"
             + (f"; it came with the package {package} {version}" if package else ""),
             where=str(run),

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from lidardesign.config import RunConfig, load_run_config, with_task_settings
 from lidardesign.errors import LidardesignError
-from lidardesign.registry import plugin_guard
+from lidardesign.plugins import plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.run.files import named, sha256_file
 from lidardesign.run.inputs import MESH

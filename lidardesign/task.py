@@ -18,6 +18,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from lidardesign.errors import ConfigError, DataError, PluginError
+from lidardesign.plugins import AUTHOR_HINT, PluginKind, check_members
 from lidardesign.run.files import sha256_file
 from lidardesign.scenes.rays import Returns
 from lidardesign.scenes.scene import Scene
@@ -293,6 +294,27 @@ class Task(Protocol):
     def score(self, scene: Scene, returns: Sequence[Returns]) -> Score:
         """The score of a design's returns in a scene, one `Returns` per time frame of the scene."""
         ...
+
+
+def check_interface(name: str, task: Any) -> dict[str, Any]:
+    """Check that an object fulfils the task contract; returns its summary, for lists.
+
+    Raises:
+        PluginError: The first member that is missing or of the wrong type.
+    """
+    check_members("task", name, task, API_VERSION, name=str, summary=str, metric=Metric, defaults=Defaults)
+    if not (isinstance(getattr(task, "Config", None), type) and issubclass(task.Config, TaskConfig)):
+        raise PluginError("its Config is not a subclass of TaskConfig", where=f"task {name}", hint=AUTHOR_HINT)
+    check_members("task", name, task, API_VERSION, space=object, scenes=object, score=object)
+    return {"summary": task.summary}
+
+
+TASKS: PluginKind[Task] = PluginKind("lidardesign.tasks", "task", check_interface)
+
+
+def load_task(name: str) -> Task:
+    """Load the installed task of a name; errors as of `PluginKind.load`."""
+    return TASKS.load(name)
 
 
 def random_generator(seed: int, *labels: str | int) -> np.random.Generator:

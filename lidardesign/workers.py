@@ -30,8 +30,7 @@ from typing import Any, Protocol, TypeVar
 
 from lidardesign import __version__
 from lidardesign.errors import ConfigError, LidardesignError, NumericalError, page
-from lidardesign.registry import distribution_of, load_task
-from lidardesign.task import Task
+from lidardesign.task import TASKS, Task, load_task
 
 ADDRESS = re.compile(r"tcp://(\[[0-9a-fA-F:]+\]|[^\s:/\[\]]+):([0-9]{1,5})")
 MOST_PROCESSES = 1024
@@ -125,7 +124,7 @@ def _call(versions: str, task: Task, function: Callable[..., Result], *arguments
 
 def _versions(task: Task) -> str:
     """Versions of this program and of a task's package, as text."""
-    return f"lidardesign {__version__} with {distribution_of(task.name) or 'no such task'}"
+    return f"lidardesign {__version__} with {TASKS.distribution_of(task.name) or 'no such task'}"
 
 
 def _check_versions(wanted: str, task: Task) -> None:

@@ -19,12 +19,11 @@ from lidardesign.config import (
 from lidardesign.constraints.document import Constraints
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.parts.statements import PartFile
-from lidardesign.registry import list_tasks, load_task
 from lidardesign.run.manifest import start_manifest, write_recorded
 from lidardesign.run.validation import parse_override, parse_overrides
 from lidardesign.run.yaml import dump_yaml
 from lidardesign.space import DIMENSIONS, DesignSpace
-from lidardesign.task import Defaults, Metric, TaskConfig
+from lidardesign.task import TASKS, Defaults, Metric, TaskConfig, load_task
 
 
 class Jitter(TaskConfig):
@@ -372,7 +371,7 @@ def unlimited(schema, path=""):
 
 
 MODELS = [DensitySettings, LearningSettings, Constraints, PartFile]
-MODELS += [load_task(item.name).Config for item in list_tasks() if item.distribution.startswith("lidardesign ")]
+MODELS += [load_task(item.name).Config for item in TASKS.listings() if item.distribution.startswith("lidardesign ")]
 
 
 @pytest.mark.parametrize("model", MODELS)

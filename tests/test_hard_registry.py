@@ -11,10 +11,10 @@ from lidardesign_tasks.flatland import FlatlandTask
 from support.command_line import files_under, make_run
 from support.plugins import GOOD, install_plugins
 
-from lidardesign import registry
+from lidardesign import plugins
 from lidardesign.errors import PluginError
 from lidardesign.run import processes
-from lidardesign.task import Score
+from lidardesign.task import TASKS, Score, load_task
 
 # How a plugin breaks when it is imported, and what is said of it.
 BROKEN = {
@@ -47,7 +47,7 @@ BROKEN = {
 @pytest.fixture
 def install(tmp_path, monkeypatch):
     """Install plugins by name into a folder on the path, as a package that is not this one's."""
-    monkeypatch.setattr(registry, "IMPORT_SECONDS", 0.3)
+    monkeypatch.setattr(plugins, "IMPORT_SECONDS", 0.3)
     monkeypatch.setattr(processes, "GRACE_SECONDS", 0.3)
     place = tmp_path / "installed"
     monkeypatch.syspath_prepend(place)
@@ -76,7 +76,7 @@ class TestBrokenPlugins:
         assert listed["good"]["summary"] == "how much of a ball is seen"
         assert listed["good"]["error"] is listed["flatland"]["error"] is None
         assert lidardesign("tasks", "show", "flatland").code == 0
-        assert registry.load_task("good").name == "good"
+        assert load_task("good").name == "good"
 
     @pytest.mark.hard_case("P5")
     @pytest.mark.parametrize("name", ["is_of_another_version", "crashes"])
@@ -116,12 +116,12 @@ class TestBrokenPlugins:
         listed = lidardesign("tasks", "list", "--json")
         assert "noted" in {entry["name"] for entry in listed.json["tasks"]}
         assert "hard_plugins_noted" not in sys.modules
-        registry.load_task("noted")
+        load_task("noted")
         assert "hard_plugins_noted" in sys.modules
 
     def test_a_plugin_that_asks_for_all_tasks_while_it_is_imported_starts_no_chain_of_processes(self, install):
-        install({"curious": "from lidardesign.registry import load_task\nload_task('good')\n" + GOOD, "good": GOOD})
-        listed = {listing.name: listing.error for listing in registry.list_tasks()}
+        install({"curious": "from lidardesign.task import load_task\nload_task('good')\n" + GOOD, "good": GOOD})
+        listed = {listing.name: listing.error for listing in TASKS.listings()}
         assert listed["curious"] is None
 
     def test_where_no_process_can_be_started_plugins_are_imported_here(self, install, monkeypatch):
@@ -131,7 +131,7 @@ class TestBrokenPlugins:
             raise OSError("no more processes")
 
         monkeypatch.setattr(processes.subprocess, "Popen", refuse)
-        listed = {listing.name: listing for listing in registry.list_tasks()}
+        listed = {listing.name: listing for listing in TASKS.listings()}
         assert listed["good"].error is None
         assert "no licence" in listed["raises"].error
 
@@ -154,5 +154,5 @@ class TestBrokenPlugins:
             def __str__(self):
                 raise RuntimeError
 
-        with pytest.raises(PluginError, match="Mute: no message"), registry.plugin_guard("mute"):
+        with pytest.raises(PluginError, match="Mute: no message"), plugins.plugin_guard("mute"):
             raise Mute

@@ -15,7 +15,6 @@ from support.spaces import log_volume
 from lidardesign.config import DensitySettings, resolve
 from lidardesign.density.objective.target import MINIMUM_POLE_COSINE, build_target
 from lidardesign.errors import ConfigError, NumericalError
-from lidardesign.registry import load_task
 from lidardesign.scenes.scene import Body, Plane, Scene, Sphere, rigid
 from lidardesign.space import (
     AZIMUTH,
@@ -25,6 +24,7 @@ from lidardesign.space import (
     DesignSpace,
     observed_point,
 )
+from lidardesign.task import load_task
 
 TURN = 2 * math.pi
 BOTH_POLES = ((-1.0, -1, -1, 0, -math.pi / 2, 0.0), (1.0, 1, 1, TURN, math.pi / 2, 4.0))

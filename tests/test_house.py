@@ -17,9 +17,10 @@ MOST_PARAMETERS, MOST_KEYS, MOST_IMPORTS = 11, 4, 20
 
 # From the ground up: a room imports its own modules and those of rooms before it.
 ROOMS = (
-    "errors", "limits", "numerics", "estimates", "run", "choices", "space", "scenes", "samples", "task", "registry",
+    "errors", "limits", "numerics", "estimates", "run", "choices", "space", "scenes", "samples", "plugins", "task",
     "config", "run_folder", "workers", "density", "sensors", "parts", "constraints", "mixture", "simulate", "rays",
-    "formats", "scoring", "fitting", "report", "clouds", "contract", "api", "studio", "cli", "__main__",
+    "formats", "scoring", "problem", "fitting", "methods", "evaluation", "report", "clouds", "contract", "api",
+    "studio", "cli", "__main__",
 )  # fmt: skip
 
 # Where a library may be imported, by the beginnings of module names; nowhere else.
@@ -50,7 +51,7 @@ SLOW_AT_TOP = {
 }  # fmt: skip
 FAST_ROOMS = (
     "limits", "run", "choices", "run_folder", "workers", "sensors", "parts", "constraints", "mixture", "fitting",
-    "formats", "cli", "registry", "task", "api", "config", "samples",
+    "formats", "cli", "plugins", "task", "api", "config", "samples",
 )  # fmt: skip
 
 # Words that say nothing of what a module, class or function holds.

@@ -10,9 +10,10 @@ from importlib.metadata import EntryPoint
 
 import pytest
 
-from lidardesign import registry
+from lidardesign import plugins
 from lidardesign.errors import ConfigError, DataError, PluginError
-from lidardesign.registry import list_tasks, load_task, plugin_guard
+from lidardesign.plugins import plugin_guard
+from lidardesign.task import TASKS, load_task
 
 GOOD = """
 from lidardesign.task import Defaults, Metric, Score, TaskConfig
@@ -35,12 +36,12 @@ def install(tmp_path, monkeypatch):
     """Install plugin modules by name, in place of the ones of this environment."""
     offers = []
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(registry, "entry_points", lambda group: [o for o in offers if o.group == group])
+    monkeypatch.setattr(plugins, "entry_points", lambda group: [o for o in offers if o.group == group])
 
     def add(name, source, module=None):
         module = module or f"plugin_{name}"
         (tmp_path / f"{module}.py").write_text(source)
-        offers.append(EntryPoint(name, f"{module}:GoodTask", registry.GROUP))
+        offers.append(EntryPoint(name, f"{module}:GoodTask", TASKS.group))
 
     yield add
     for name in [name for name in sys.modules if name.startswith("plugin_")]:
@@ -71,10 +72,10 @@ def test_a_plugin_that_prints_on_import_leaves_stdout_alone(install, capsys):
 
 
 def test_an_import_that_hangs_is_interrupted(install, monkeypatch):
-    monkeypatch.setattr(registry, "IMPORT_SECONDS", 0.05)
+    monkeypatch.setattr(plugins, "IMPORT_SECONDS", 0.05)
     install("good", "import time\ntime.sleep(30)\n" + GOOD)
     started = time.monotonic()
-    assert "was not imported within" in list_tasks()[0].error
+    assert "was not imported within" in TASKS.listings()[0].error
     assert time.monotonic() - started < 10
 
 

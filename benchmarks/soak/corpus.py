@@ -24,11 +24,10 @@ from support.sensors import normal_sensor
 
 from benchmarks.soak.mutators import packed
 from lidardesign.config import resolve
+from lidardesign.formats import FORMATS, write_design
 from lidardesign.formats.galvo import write_galvo
 from lidardesign.formats.ray_lists import QUERY_COLUMN, write_sensor_csv
-from lidardesign.formats.registry import EXPORTERS
 from lidardesign.parts.catalogue import FOLDER as PARTS
-from lidardesign.registry import load_task
 from lidardesign.run.manifest import record
 from lidardesign.run.yaml import dump_yaml
 from lidardesign.scenes.rays import Rays
@@ -37,6 +36,7 @@ from lidardesign.sensors.design_file import design_document, save_design
 from lidardesign.sensors.pattern import Pattern
 from lidardesign.sensors.sensor import Sensor
 from lidardesign.simulate.detector.files import FOLDER as DETECTORS
+from lidardesign.task import load_task
 
 ROOT = Path(__file__).parents[2]
 TASKS = ("flatland", "meshes", "face", "arm", "warehouse", "emitter")
@@ -310,10 +310,10 @@ def rigs(kind: str) -> Callable[[Path], list[bytes]]:
     """Designs as other programs have them."""
 
     def good(folder: Path) -> list[bytes]:
-        found, exporter = [], EXPORTERS[kind]
+        found, chosen = [], FORMATS.load(kind)
         for index in (0, 1) if kind in ("sdf", "mjcf") else (1, 4):
-            design, path = sample_designs()[index], folder / f"rig{index}{exporter.suffix}"
-            exporter.write(design, design.rays(), path)
+            design, path = sample_designs()[index], folder / f"rig{index}{chosen.suffix}"
+            write_design(chosen, design, design.rays(), path)
             found.append(path.read_bytes())
         return found
 

@@ -39,9 +39,9 @@ from lidardesign.config import SECTIONS, config_of, resolve
 from lidardesign.constraints.document import load_constraints
 from lidardesign.constraints.feasibility import check_feasible
 from lidardesign.errors import InfeasibleError, LidardesignError
-from lidardesign.registry import load_task
 from lidardesign.run.yaml import dump_yaml, load_yaml, parse_yaml
 from lidardesign.sensors.design_file import design_document, design_from_document, save_design
+from lidardesign.task import load_task
 
 MOST_FIRED = 5000
 

@@ -24,7 +24,7 @@ from lidardesign.config import (
 from lidardesign.constraints.document import Constraints
 from lidardesign.errors import ConfigError, check_choice
 from lidardesign.limits import MAX_SEED
-from lidardesign.registry import plugin_guard
+from lidardesign.plugins import plugin_guard
 from lidardesign.run.validation import parse_override
 from lidardesign.run.yaml import dump_yaml
 from lidardesign.sensors.design_file import DesignFile

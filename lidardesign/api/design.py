@@ -15,8 +15,9 @@ from lidardesign.api.export import (
     Exported,
     ExportRequest,
     export_target,
-    exporter_of,
+    format_of,
 )
+from lidardesign.api.problems import MethodRequest, problem_of
 from lidardesign.choices.files import ExportChoices, SimulateChoices
 from lidardesign.choices.flag import complete, takes
 from lidardesign.errors import ConfigError, names_arguments
@@ -76,13 +77,15 @@ class Design(DesignSource):
     @classmethod
     def fitted(
         cls,
-        request: FitRequest,
+        request: FitRequest | MethodRequest,
         *,
         workers: int | str = 1,
         notes: Notes = log_note,
         progress: Progress | None = None,
     ) -> Design:
         """The design that a request comes to; it is not saved yet. `progress` is called with every step."""
+        if isinstance(request, MethodRequest):
+            return cls(request.design(), request.run)
         from lidardesign.fitting.fit import fit_design
 
         steps = ignore if progress is None else (lambda step: progress(step, None, None))
@@ -111,7 +114,7 @@ class Design(DesignSource):
             InfeasibleError: Constraints that contradict each other, or hold too little of the density.
         """
         run = need_run(self.run, self.name if self.path is None else self.path)
-        request = FitRequest.resolve(run, choices, self.specification, notes=notes)
+        request = problem_of(run, choices, self.specification, notes=notes)
         return Design.fitted(request, workers=choices.get("workers", 1), notes=notes, progress=progress)
 
     def remounted(self, sensor: int, origin_m: Sequence[float], frame: np.ndarray) -> Design:
@@ -176,12 +179,10 @@ class Design(DesignSource):
             choices: Those of `ExportChoices`.
             notes: Called with every note.
         """
-        chosen, out = complete(ExportChoices, choices), None if path is None else Path(path)
-        exporter = exporter_of(format, out)
-        target = export_target(self.path, out, exporter)
-        request = ExportRequest(
-            self, exporter, target, chosen["rays"], chosen["at"], chosen["rate_hz"], chosen["robot"]
-        )
+        given, out = complete(ExportChoices, choices), None if path is None else Path(path)
+        chosen = format_of(format, out)
+        target = export_target(self.path, out, chosen.suffix)
+        request = ExportRequest(self, chosen, target, given["rays"], given["at"], given["rate_hz"], given["robot"])
         return request.write(notes=notes)
 
     @takes(SimulateChoices)

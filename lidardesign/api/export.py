@@ -10,17 +10,14 @@ from typing import Any
 import numpy as np
 
 from lidardesign.errors import BackgroundNote, ConfigError
+from lidardesign.formats import FORMATS, RAYS, ROBOT, Format, check_rate, shipped_formats, write_design
 from lidardesign.formats.designs import folder_of
-from lidardesign.formats.registry import EXPORTERS, Exporter
 from lidardesign.run.clock import phase
 from lidardesign.run_folder import Notes, RunFolder, log_note
 from lidardesign.scenes.mujoco_models import RobotFile
 from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.space import condition_values
-
-# Formats that hold sensors only.
-WITHOUT_RAYS = ("sensors-csv", "stl", "mounts")
 
 
 class DesignSource:
@@ -120,7 +117,7 @@ class ExportRequest:
 
     Arguments:
         source: The design.
-        exporter: The format.
+        format: The format.
         target: The file or folder to write.
         rays: Rays per frame; None takes the design's own.
         at: Condition values.
@@ -130,7 +127,7 @@ class ExportRequest:
     """
 
     source: DesignSource
-    exporter: Exporter
+    format: Format
     target: Path
     rays: int | None = None
     at: Mapping[str, float] | Sequence[str] = ()
@@ -138,15 +135,14 @@ class ExportRequest:
     robot: Path | None = None
 
     def __post_init__(self) -> None:
-        name = self.exporter.name
-        if self.rays is not None and name in WITHOUT_RAYS:
-            raise ConfigError(f"{name} holds sensors, not rays", where="--rays", hint="leave it out")
-        self.exporter.check_rate(self.rate_hz)
+        if self.rays is not None and RAYS not in self.format.holds:
+            raise ConfigError(f"{self.format.name} holds sensors, not rays", where="--rays", hint="leave it out")
+        check_rate(self.format, self.rate_hz)
 
     def _robot(self) -> RobotFile | None:
         """The robot's model that the sensors are put into; None for sensors alone."""
         mounted = self.source.specification.mount is not None
-        run = self.source.opened_run() if self.exporter.robotic and (mounted or self.robot) else None
+        run = self.source.opened_run() if ROBOT in self.format.holds and (mounted or self.robot) else None
         task = None if run is None else run.config.task
         path = self.robot or (getattr(task, "model", None) if mounted else None)
         if path is not None and path.exists() and self.target.exists() and path.samefile(self.target):
@@ -160,36 +156,37 @@ class ExportRequest:
             file: What is written instead of the target, which it is copied to later.
             notes: Called with every note.
         """
-        file, exporter = self.target if file is None else file, self.exporter
-        count = 0 if exporter.name in WITHOUT_RAYS else self.rays
+        file = self.target if file is None else file
+        count = self.rays if RAYS in self.format.holds else 0
         design, rays = self.source.at(count, condition_values(self.at), notes)
         with phase("writing"):
-            lost = tuple(exporter.write(design, rays, file, self.rate_hz, self._robot()))
+            lost = tuple(write_design(self.format, design, rays, file, self.rate_hz, self._robot()))
         for note in lost:
             notes(note)
         written = [path for path in (file, *file.rglob("*")) if path.is_file()]
         size = sum(path.stat().st_size for path in written) if written or file.is_dir() else None
-        return Exported(self.target, exporter.name, len(rays), len(design.sensors), size, lost)
+        return Exported(self.target, self.format.name, len(rays), len(design.sensors), size, lost)
 
 
-def exporter_of(name: str | None, path: Path | None = None) -> Exporter:
-    """The format of a name; without one that whose suffix a path has.
+def format_of(name: str | None, path: Path | None = None) -> Format:
+    """The format of a name; without one the shipped one whose suffix a path has.
 
     Raises:
         ConfigError: There is none.
+        PluginError: It is of another package, and broken.
     """
     if name is None and path is not None:
-        fitting = [exporter for exporter in EXPORTERS.values() if path.name.endswith(exporter.suffix)]
+        fitting = [one for one in shipped_formats() if path.name.endswith(one.suffix)]
         if fitting:
-            return max(fitting, key=lambda exporter: len(exporter.suffix))
-    if name not in EXPORTERS:
+            return max(fitting, key=lambda one: len(one.suffix))
+    if name is None or name not in FORMATS.names():
         problem = "no format was given" if name is None else f"unknown format {name!r}"
-        raise ConfigError(problem, where="--format", allowed=", ".join(EXPORTERS))
-    return EXPORTERS[name]
+        raise ConfigError(problem, where="--format", allowed=FORMATS.allowed())
+    return FORMATS.load(name)
 
 
-def export_target(path: Path | None, out: Path | None, exporter: Exporter) -> Path:
-    """The path that an export is written to: the given one, else beside the design's file.
+def export_target(path: Path | None, out: Path | None, suffix: str) -> Path:
+    """The path that an export is written to: the given one, else with a suffix beside the design's file.
 
     Raises:
         ConfigError: It is the design's own file, or neither path is given.
@@ -198,7 +195,7 @@ def export_target(path: Path | None, out: Path | None, exporter: Exporter) -> Pa
         raise ConfigError(
             "a design without a file has no folder to write to", hint="save it, or say where to write the export"
         )
-    target = out if out is not None else path.with_suffix(exporter.suffix)
+    target = out if out is not None else path.with_suffix(suffix)
     if path is not None and target.exists() and path.exists() and target.samefile(path):
         raise ConfigError("would overwrite the design itself", where=str(target), hint="give another --out")
     return target

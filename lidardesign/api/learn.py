@@ -21,7 +21,7 @@ from lidardesign.errors import (
     ThresholdError,
     pasted,
 )
-from lidardesign.registry import distribution_of, load_task, plugin_guard, task_names
+from lidardesign.plugins import plugin_guard
 from lidardesign.run.clock import WAIT_S, Clock, outermost_clock, phase
 from lidardesign.run.files import exchange, is_held, is_temporary, named, remove, run_lock, writer
 from lidardesign.run.manifest import note, start_manifest
@@ -40,7 +40,7 @@ from lidardesign.run_folder import (
     log_note,
     settings_texts,
 )
-from lidardesign.task import FolderConfig, Task, notes_of
+from lidardesign.task import TASKS, FolderConfig, Task, load_task, notes_of
 
 if TYPE_CHECKING:
     from lidardesign.density.training.learn import LearnProgress, LearnResult
@@ -238,7 +238,7 @@ class LearnRequest:
                 if not self.begun:
                     # Write what the run is before anything is learned; the configuration last
                     start_manifest(folder, command=list(self.command), seed=settings.seed)
-                    note(folder, plugin=distribution_of(self.task.name), **{INPUTS: input_hashes(settings.task)})
+                    note(folder, plugin=TASKS.distribution_of(self.task.name), **{INPUTS: input_hashes(settings.task)})
                     save_run_config(settings, folder)
                 try:
                     result = learn(
@@ -341,7 +341,7 @@ def _task_named(config_file: Path | None, run: Path | None) -> str:
         raise ConfigError(
             "no task was named",
             where="TASK",
-            allowed=", ".join(task_names()),
+            allowed=", ".join(TASKS.names()),
             hint="lidardesign learn TASK, or task_name: TASK in the file of --config",
         )
     return next(str(name) for name in named if name)

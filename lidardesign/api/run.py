@@ -2,33 +2,33 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
 from lidardesign.api.design import Design, html_table
 from lidardesign.api.learn import LearnRequest, check_tolerance
+from lidardesign.api.problems import problem_of
 from lidardesign.choices.evaluate import EvaluateChoices
 from lidardesign.choices.flag import takes
 from lidardesign.choices.learn import LearnChoices
-from lidardesign.errors import ConfigError, DataError, LidardesignError, names_arguments, pasted
-from lidardesign.fitting.options import DesignChoices, fit_choices
-from lidardesign.fitting.request import FitRequest
-from lidardesign.formats.designs import folder_of, reach_of, read_design, relative_folder
+from lidardesign.errors import DataError, LidardesignError, names_arguments, pasted
+from lidardesign.fitting.options import DesignChoices
+from lidardesign.formats.designs import folder_of, reach_of, read_design
 from lidardesign.run.clock import Progress
 from lidardesign.run.files import writer
 from lidardesign.run.manifest import DAMAGED_HINT, read_manifest
 from lidardesign.run.outputs import CACHE
 from lidardesign.run_folder import MANIFEST, Notes, RunFolder, log_note
-from lidardesign.task import Metric, mount_of
+from lidardesign.task import Metric
 
 if TYPE_CHECKING:
     from lidardesign.api.scores import Scores
     from lidardesign.density.training.learned import LearnedDensity
     from lidardesign.samples import Verdict
 
-FIXED_BASELINES = ("uniform", "bounding", "silhouette", "lloyd", "greedy")  # with the same rays in every scene
 FIGURES = ("ess", "kl_nats", "log_z", "coverage", "misplaced")
 
 
@@ -133,7 +133,7 @@ class Run(RunFolder):
             DataError: The density is too rough to fit to.
             InfeasibleError: Constraints that contradict each other, or hold too little of the density.
         """
-        request = FitRequest.resolve(self, choices, notes=notes)
+        request = problem_of(self, choices, notes=notes)
         return Design.fitted(request, workers=choices.get("workers", 1), notes=notes, progress=progress)
 
     def designs(self) -> list[Design]:
@@ -177,43 +177,9 @@ class Run(RunFolder):
     def baseline(
         self, baseline: str, *, rays: int | None = None, name: str | None = None, seed: int | None = None
     ) -> Design:
-        """The design that fires the rays of a baseline, as `evaluate` has it at this number of rays; not saved yet.
-
-        Arguments:
-            baseline: Its name, as "greedy" or "bounding".
-            rays: Rays per frame; the task's middle number by default.
-            name: The design's name; "greedy-rays" for greedy.
-            seed: Seed of all random numbers; the run's by default.
-
-        Raises:
-            ConfigError: No such baseline, or one without rays of its own that stay the same in every scene.
-        """
-        from lidardesign.api.scores import evaluation_request
-        from lidardesign.formats.rig import Rig, RigSensor, rig_design
-        from lidardesign.scoring.baselines.simple import check_baseline
-        from lidardesign.evaluation.entries import entries_of
-
-        check_baseline(baseline)
-        name = name or f"{baseline}-rays"
-        numbers = sorted(self.task.defaults.rays)
-        count = numbers[len(numbers) // 2] if rays is None else rays
-        fit_choices({"rays": count, "name": name})  # refuses what no design can have
-        found = []
-        if baseline in FIXED_BASELINES:
-            request = evaluation_request(self, [], [count], [baseline], seed)
-            found = entries_of(replace(request, equal_bandwidth=False))
-        if len(found) != 1 or len(found[0].positions) > 1:
-            raise ConfigError(
-                f"{baseline} has no fixed list of {count} rays here",
-                where="baseline",
-                allowed=", ".join(FIXED_BASELINES),
-            )
-        fired = found[0].positions[0].as_angles()
-        sensor = RigSensor("s0", fired.origin_m, fired.azimuth_rad, fired.elevation_rad, fired.gate_m)
-        design = rig_design(Rig(f"baseline {baseline}", [sensor], [], ""), Path(baseline), None)
-        mount, origin = mount_of(self.task, self.config.task), relative_folder(self.folder, self.design_path(name))
-        origin = {**design.provenance, "task": self.task.name, "run": origin}
-        return Design(replace(design, name=name, mount=mount, provenance=origin), self)
+        """As `fit(method=...)`, which takes its place."""
+        warnings.warn("use run.fit(method=...)", DeprecationWarning, stacklevel=3)
+        return self.fit(method=baseline, rays=rays, name=name or f"{baseline}-rays", seed=seed)
 
     def _next_commands(self, designs: Sequence[Mapping[str, Any]], finished: bool, metric: Metric) -> list[str]:
         """Command lines of the next steps."""

@@ -17,26 +17,33 @@ from lidardesign.choices.evaluate import EvaluateChoices, NamedChoices
 from lidardesign.choices.flag import complete
 from lidardesign.config import with_task_settings
 from lidardesign.errors import ConfigError, names_arguments
+from lidardesign.evaluation.headline import check_audit, check_better, check_limit
+from lidardesign.evaluation.last_scores import SCORES, last_scores_of
+from lidardesign.evaluation.mounting import MountError
+from lidardesign.evaluation.request import (
+    ALWAYS,
+    NONE,
+    EvaluationRequest,
+    check_baseline,
+    counts_without_baselines,
+    usual_numbers,
+)
+from lidardesign.evaluation.results import Evaluation, Paired, Row, write_csv
+from lidardesign.evaluation.score import evaluate as score_designs
 from lidardesign.fitting.fit import twin_samples, twin_without_visibility
+from lidardesign.methods.cma import CMA, DEFAULT_SECONDS, CmaSettings
+from lidardesign.problem.method import METHODS
 from lidardesign.rays.training_scenes import TrainingScenes
 from lidardesign.run.clock import Progress, outermost_clock, phase, running
 from lidardesign.run_folder import DESIGN_FOLDER, SAMPLES, Notes, RunFolder, log_note, settings_texts
 from lidardesign.samples import load_samples
-from lidardesign.methods.cma import CMA, DEFAULT_SECONDS, CmaSettings
-from lidardesign.scoring.baselines.simple import ALWAYS, BASELINES, NONE, check_baseline
-from lidardesign.evaluation.headline import check_audit, check_better, check_limit
-from lidardesign.evaluation.last_scores import SCORES, last_scores_of
-from lidardesign.evaluation.mounting import MountError
-from lidardesign.evaluation.request import EvaluationRequest, counts_without_baselines, usual_numbers
-from lidardesign.evaluation.results import Evaluation, Paired, Row, write_csv
-from lidardesign.evaluation.score import evaluate as score_designs
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.plan import Planner, Tolerance, parse_effects
 from lidardesign.workers import check_workers, opened_workers
 
 if TYPE_CHECKING:
-    from lidardesign.report.figures import Figure
     from lidardesign.methods.cma import Show
+    from lidardesign.report.figures import Figure
 
 MILLIMETRES = 1000.0
 COMMAND = "evaluate"
@@ -53,7 +60,7 @@ def score_choices(given: NamedChoices) -> NamedChoices:
     misplacement(choices)
     baselines, limit = choices["baselines"], choices["fail_above"]
     if NONE in baselines:
-        if len(baselines) > 1 or choices["fail_unless_better"] in BASELINES:
+        if len(baselines) > 1 or choices["fail_unless_better"] in METHODS.names():
             raise ConfigError(
                 "none beside a baseline that this or --fail-unless-better names",
                 where="--baseline",
@@ -151,7 +158,7 @@ class ScoreRequest:
         baselines = (
             []
             if NONE in choices["baselines"]
-            else [*ALWAYS, *choices["baselines"], *([baseline] if baseline in BASELINES else [])]
+            else [*ALWAYS, *choices["baselines"], *([baseline] if baseline in METHODS.names() else [])]
         )
         rays = choices["rays"] or usual_numbers([design.specification for design in designs], run.task.defaults.rays)
         if choices["accuracy"]:
@@ -196,13 +203,12 @@ class ScoreRequest:
         request = evaluation_request(
             self.run, self.designs, self.rays, self.baselines, self.seed, self.choices["scenes_seed"], self.learned
         )
-        cma = CmaSettings(self.cma_seconds, show=searching)
         misplaced = misplacement(self.choices)
         return replace(
             request,
             planner=self.planner,
             audit=self.audit,
-            cma=cma,
+            settings={CMA: CmaSettings(self.cma_seconds, show=searching)},
             mount_error=misplaced,
             losses=self.choices["losses"],
             alone=self.alone,
@@ -226,7 +232,7 @@ class ScoreRequest:
             with opened_workers(workers, request.task, len(request.test)) as starmap:
                 evaluation = score_designs(replace(request, starmap=starmap), progress=progress)
             timings = clock.timings()
-        return Scores(evaluation, replace(request, cma=replace(request.cma, show=None)), self.learned, timings, self)
+        return Scores(evaluation, replace(request, settings={}), self.learned, timings, self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -372,7 +378,7 @@ def check_scores(scores: Scores) -> None:
 def _check_baseline(name: str | None, designs: Sequence[str]) -> None:
     """Refuse a baseline or design that is unknown, or the only design."""
     where = "--fail-unless-better"
-    if name is None or name in BASELINES:
+    if name is None or name in METHODS.names():
         return
     if name not in designs:
         allowed = f"a baseline, or a design: {', '.join(designs)}"

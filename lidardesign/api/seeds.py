@@ -18,12 +18,12 @@ from lidardesign.api.scores import ScoreRequest, Scores, score_choices
 from lidardesign.choices.evaluate import NamedChoices
 from lidardesign.choices.flag import takes
 from lidardesign.errors import ConfigError, DataError, pasted
-from lidardesign.formats.designs import read_design
-from lidardesign.run.clock import Progress, outermost_clock, running
-from lidardesign.run_folder import Notes, RunFolder, log_note
 from lidardesign.evaluation.request import usual_numbers
 from lidardesign.evaluation.score import progress_of_part
 from lidardesign.evaluation.seeds import over_seeds
+from lidardesign.formats.designs import read_design
+from lidardesign.run.clock import Progress, outermost_clock, running
+from lidardesign.run_folder import Notes, RunFolder, log_note
 
 if TYPE_CHECKING:
     from lidardesign.methods.cma import Show

@@ -38,6 +38,16 @@ class FitChoices(TypedDict, total=False):
             words=LAYOUTS,
         ),
     ]
+    method: Annotated[
+        str | None,
+        Flag(
+            "--method",
+            "NAME",
+            "Make the design by a method: what --layout names, greedy, or another of `methods list`.",
+            "that of --layout",
+            offers="methods",
+        ),
+    ]
     rays: RayCount
     channels: Annotated[
         int | None,

@@ -85,15 +85,20 @@ class NewDesign(TypedDict, total=False):
     out: Annotated[Path | None, Flag("--out", "FILE.yaml", "Write a design of the part.", kind=Path)]
 
 
-class CheckCommand(TypedDict, total=False):
-    """The options of `tasks check`."""
+class LawChoices(TypedDict, total=False):
+    """The options of `check` of any plugin."""
 
-    config: ConfigFile
-    settings: LearningSettings
     seconds: Annotated[
         float,
         Flag("--seconds", "S", "Longest time that one call may take.", None, 60.0, float, *LAW_SECONDS),
     ]
+
+
+class CheckCommand(LawChoices, total=False):
+    """The options of `tasks check`."""
+
+    config: ConfigFile
+    settings: LearningSettings
     seed: Seed
 
 

@@ -15,7 +15,7 @@ from lidardesign.cli.commands.capture import capture
 from lidardesign.cli.commands.catalog import catalog_app
 from lidardesign.cli.commands.config import config_app
 from lidardesign.cli.commands.evaluate import evaluate
-from lidardesign.cli.commands.export import export
+from lidardesign.cli.commands.export import export, formats_app
 from lidardesign.cli.commands.fit import constrain, fit
 from lidardesign.cli.commands.learn import learn
 from lidardesign.cli.commands.show import show
@@ -99,6 +99,9 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "tasks show": ("lidardesign tasks show face",),
     "tasks check": ("lidardesign tasks check meshes --set folder=scans --json",),
     "tasks new": ("lidardesign tasks new landmark --out work/landmark",),
+    "formats list": ("lidardesign formats list",),
+    "formats show": ("lidardesign formats show mjcf",),
+    "formats check": ("lidardesign formats check csv --json",),
     "config init": ("lidardesign config init meshes --set folder=scans --out scans.yaml",),
     "config schema": ("lidardesign config schema config --task face --out face.json",),
 }
@@ -114,6 +117,7 @@ PAGES = {
     "show": "design-file.md, rigs.md, formats.md",
     "catalog": "catalog.md",
     "tasks": "writing-tasks.md",
+    "formats": "formats.md, writing-methods.md",
     "config": "run-folder.md, shell.md",
 }
 
@@ -138,11 +142,13 @@ app = typer.Typer(
     rich_markup_mode=None,  # panels take half as long again, and fold at 80 columns
 )
 app.add_typer(tasks_app, name="tasks", context_settings=SETTINGS)
+app.add_typer(formats_app, name="formats", context_settings=SETTINGS)
 app.add_typer(catalog_app, name="catalog", context_settings=SETTINGS)
 app.add_typer(config_app, name="config", context_settings=SETTINGS)
 for subcommand in (learn, fit, constrain, evaluate, studio, simulate, export, capture, show):
     app.command()(subcommand)
-for prefix, group in (("", app), ("tasks ", tasks_app), ("catalog ", catalog_app), ("config ", config_app)):
+groups = {"": app, "tasks ": tasks_app, "formats ": formats_app, "catalog ": catalog_app, "config ": config_app}
+for prefix, group in groups.items():
     for registered in group.registered_commands:
         name = registered.name or registered.callback.__name__
         registered.cls, registered.context_settings = StrictCommand, SETTINGS

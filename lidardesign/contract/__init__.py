@@ -1,4 +1,4 @@
-"""The contract of task plugins as testable laws: from Python, by `tasks check` and in pytest.
+"""The contracts of plugins as testable laws: from Python, by `tasks check`, `formats check` and in pytest.
 
 `check_task(MyTask())` tries all of them; the modules are the groups of laws: `interface`, `scenes`,
 `scoring` and `contract`. The names here are loaded when they are used.
@@ -17,6 +17,7 @@ _HOMES = {
     "Contract": "contract",
     "check_task": "contract",
     "contract_of": "contract",
+    "contract_of_format": "contract",
 }
 __all__ = sorted(_HOMES)
 

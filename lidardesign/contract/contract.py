@@ -1,4 +1,4 @@
-"""The whole contract of a task plugin, law by law, each tried once.
+"""The whole contracts of task plugins and of formats, law by law, each tried once.
 
 The laws of random state and time are here, the others in the modules of their groups.
 """
@@ -8,9 +8,8 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping, Sequence
 
-from lidardesign import registry
 from lidardesign.config import RunConfig, resolve
-from lidardesign.contract import scenes, scoring
+from lidardesign.contract import formats, scenes, scoring
 from lidardesign.contract.law import (
     CALL_SECONDS,
     BrokenLawError,
@@ -19,15 +18,18 @@ from lidardesign.contract.law import (
     LawHolds,
     NotApplicable,
     Subject,
+    Tried,
     error_words,
     place_of,
     restore_random_states,
 )
 from lidardesign.errors import ConfigError, LidardesignError, text_of
-from lidardesign.task import Task
+from lidardesign.formats import Format, check_format
+from lidardesign.plugins import plugin_guard
+from lidardesign.task import Task, check_interface
 
 
-def check_random(subject: Subject) -> LawHolds:
+def check_random(subject: Tried) -> LawHolds:
     """No global random state is drawn from or seeded."""
     if subject.drawn:
         raise BrokenLawError(
@@ -37,40 +39,46 @@ def check_random(subject: Subject) -> LawHolds:
     return LawHolds("Python's, numpy's and torch's random states are as they were")
 
 
-def check_time(subject: Subject) -> LawHolds:
-    """Every call of the task's code ends within the limit."""
+def check_time(subject: Tried) -> LawHolds:
+    """Every call of the plugin's code ends within the limit."""
     limit = subject.limit_s
     slow = [what for what, seconds in subject.seconds.items() if seconds > limit]
     if slow:
         raise BrokenLawError(
             f"{slow[0]} took {subject.seconds[slow[0]]:.1f} s",
             allowed=f"{limit:g} s",
-            hint="check fewer or smaller scenes (--set), or allow more (--seconds)",
+            hint=("check fewer or smaller scenes (--set), or " * (subject.noun == "task")) + "allow more (--seconds)",
         )
     said = ", ".join(f"{what} {seconds:.3f} s" for what, seconds in subject.seconds.items())
     return LawHolds(f"at most: {said}", {f"{what}_s": round(seconds, 4) for what, seconds in subject.seconds.items()})
 
 
-_AFTER = ("scores are numbers", "returns inform")
-CONDUCT_LAWS = (
-    Law("no global random state", "conduct", "no global random state is used", check_random, after=_AFTER),
-    Law("within time", "conduct", "every call ends in time", check_time, after=_AFTER),
+def _with_conduct(*laws: Law, after: tuple[str, ...]) -> tuple[Law, ...]:
+    """Laws, and those of conduct, which look at calls that were made for some of them."""
+    return (
+        *laws,
+        Law("no global random state", "conduct", "no global random state is used", check_random, after=after),
+        Law("within time", "conduct", "every call ends in time", check_time, after=after),
+    )
+
+
+LAWS = _with_conduct(
+    *scenes.INTERFACE_LAWS, *scenes.SCENE_LAWS, *scoring.LAWS, after=("scores are numbers", "returns inform")
 )
-
-
-LAWS: tuple[Law, ...] = (*scenes.INTERFACE_LAWS, *scenes.SCENE_LAWS, *scoring.LAWS, *CONDUCT_LAWS)
+FORMAT_LAWS = _with_conduct(*formats.LAWS, after=("designs are written", "says what it holds", "rays come back"))
 
 
 class Contract:
-    """The laws of one task with one configuration, each tried when it is asked for, and once.
+    """The laws of one plugin, of a task with one configuration, each tried when it is asked for, and once.
 
     Arguments:
-        subject: The task.
+        subject: The plugin.
     """
 
-    def __init__(self, subject: Subject) -> None:
+    def __init__(self, subject: Tried) -> None:
         self.subject = subject
-        self._laws: Mapping[str, Law] = {law.name: law for law in LAWS}
+        laws = LAWS if subject.noun == "task" else FORMAT_LAWS
+        self._laws: Mapping[str, Law] = {law.name: law for law in laws}
         self._findings: dict[str, Finding] = {}
 
     def finding(self, name: str) -> Finding:
@@ -87,8 +95,7 @@ class Contract:
 
     def findings(self) -> Iterator[Finding]:
         """The finding of each law, in order."""
-        for law in LAWS:
-            yield self.finding(law.name)
+        yield from map(self.finding, self._laws)
 
     def _tried(self, law: Law) -> Finding:
         known = (law.name, law.group, law.statement)
@@ -131,13 +138,24 @@ def contract_of(
         PluginError: The task lacks a member of the interface.
         ConfigError: The configuration is refused.
     """
-    with registry.plugin_guard(str(getattr(task, "name", type(task).__name__))):
-        registry.check_interface(str(getattr(task, "name", "")), task)
+    with plugin_guard(str(getattr(task, "name", type(task).__name__))):
+        check_interface(str(getattr(task, "name", "")), task)
     drawn: list[str] = []
     if config is None:
         with restore_random_states(drawn, "space"):
             config = resolve(task, overrides=overrides)
     return Contract(Subject(task, config, limit_s, drawn))
+
+
+def contract_of_format(format: Format) -> Contract:
+    """The contract of a format, registered or not.
+
+    Raises:
+        PluginError: The format lacks a member of the interface.
+    """
+    with plugin_guard(str(getattr(format, "name", type(format).__name__)), "format"):
+        check_format(str(getattr(format, "name", "")), format)
+    return Contract(formats.FormatSubject(format))
 
 
 def check_task(task: Task, *, overrides: Sequence[str] = (), limit_s: float = CALL_SECONDS) -> list[Finding]:
@@ -152,11 +170,11 @@ def check_task(task: Task, *, overrides: Sequence[str] = (), limit_s: float = CA
         BrokenLawError: A law does not hold; the message names all that do not.
     """
     findings = list(contract_of(task, overrides=overrides, limit_s=limit_s).findings())
-    refuse_broken(task.name, findings)
+    refuse_broken(f"task {task.name}", findings)
     return findings
 
 
-def refuse_broken(name: str, findings: Sequence[Finding]) -> None:
+def refuse_broken(where: str, findings: Sequence[Finding]) -> None:
     """Name the laws that do not hold.
 
     Raises:
@@ -165,4 +183,4 @@ def refuse_broken(name: str, findings: Sequence[Finding]) -> None:
     broken = [finding for finding in findings if finding.outcome == "fail"]
     if broken:
         listed = "; ".join(f"{finding.law}: {finding.detail}" for finding in broken)
-        raise BrokenLawError(f"broken laws: {len(broken)} of {len(findings)}: {listed}", where=f"task {name}")
+        raise BrokenLawError(f"broken laws: {len(broken)} of {len(findings)}: {listed}", where=where)

@@ -24,7 +24,7 @@ from pydantic import BaseModel
 
 from lidardesign.config import RunConfig
 from lidardesign.errors import LidardesignError, PluginError
-from lidardesign.registry import AUTHOR_HINT, plugin_guard
+from lidardesign.plugins import AUTHOR_HINT, plugin_guard
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import Outcome, Rays, Returns
 from lidardesign.scenes.scene import Body, Scene
@@ -38,7 +38,7 @@ PACKAGE = Path(__file__).parents[1]
 # Libraries that tasks call, and that errors are raised in when they are called wrongly.
 LIBRARIES = ("numpy", "scipy", "trimesh", "pydantic", "mujoco")
 LawOutcome = Literal["pass", "fail", "skip"]
-# What comes before all laws: name, group and statement.
+# What comes before all laws, formats having no configuration: name, group and statement.
 LOADS = (
     "plugin loads",
     "interface",
@@ -58,7 +58,7 @@ SEED = 20_251
 
 
 class BrokenLawError(PluginError):
-    """A law of the contract that a task does not keep; the message says how, with figures (exit 6)."""
+    """A law of its contract that a plugin does not keep; the message says how, with figures (exit 6)."""
 
 
 class LawHolds(NamedTuple):
@@ -69,7 +69,7 @@ class LawHolds(NamedTuple):
 
 
 class NotApplicable(NamedTuple):
-    """A law that does not apply to this task, with the reason."""
+    """A law that does not apply to this plugin, with the reason."""
 
     reason: str
 
@@ -90,7 +90,7 @@ class Law:
     name: str
     group: str
     statement: str
-    check: Callable[[Subject], LawHolds | NotApplicable]
+    check: Callable[[Any], LawHolds | NotApplicable]
     needs: tuple[str, ...] = ()
     after: tuple[str, ...] = ()
 
@@ -193,31 +193,29 @@ def _random_states() -> dict[str, Any]:
 
 
 @dataclass(eq=False)
-class Subject:
-    """A task with a configuration, tried by the laws.
+class Tried:
+    """A plugin, tried by the laws of its contract.
 
     Arguments:
-        task: The plugin.
-        config: Its resolved configuration.
+        noun: What it is, a task or a format.
+        name: Its name.
         limit_s: Time limit of one call of its code [s].
         drawn: Global random states that its code drew from or seeded, with the call.
         on_call: Called with a description before every call of its code, and with "" after it.
     """
 
-    task: Task
-    config: RunConfig
+    noun: str
+    name: str
     limit_s: float = CALL_SECONDS
     drawn: list[str] = field(default_factory=list)
     on_call: Callable[[str], None] = lambda what: None
 
     def __post_init__(self) -> None:
         self.seconds: dict[str, float] = {}
-        self._scenes: dict[tuple[Split, int], list[Scene]] = {}
-        self._rays: dict[tuple[int, int], list[Rays]] = {}
 
     @contextlib.contextmanager
     def calling(self, what: str) -> Iterator[None]:
-        """A context for a call of the task's code: an exception breaks the law, and the longest time is kept.
+        """A context for a call of the plugin's code: an exception breaks the law, and the longest time is kept.
 
         Raises:
             BrokenLawError: It raised an exception.
@@ -225,7 +223,7 @@ class Subject:
         self.on_call(what)
         started = time.perf_counter()
         try:
-            with restore_random_states(self.drawn, what), plugin_guard(self.task.name):
+            with restore_random_states(self.drawn, what), plugin_guard(self.name, self.noun):
                 yield
         except LidardesignError as error:
             told = error.message if error.message.startswith((what, "scoring")) else f"{what} failed: {error.message}"
@@ -233,6 +231,22 @@ class Subject:
         finally:
             self.seconds[what] = max(self.seconds.get(what, 0.0), time.perf_counter() - started)
             self.on_call("")
+
+
+class Subject(Tried):
+    """A task with a configuration, tried by the laws.
+
+    Arguments:
+        task: The plugin.
+        config: Its resolved configuration.
+        conduct: The limit and what else `Tried` takes.
+    """
+
+    def __init__(self, task: Task, config: RunConfig, *conduct: Any) -> None:
+        super().__init__("task", task.name, *conduct)
+        self.task, self.config = task, config
+        self._scenes: dict[tuple[Split, int], list[Scene]] = {}
+        self._rays: dict[tuple[int, int], list[Rays]] = {}
 
     def new_scenes(self, split: Split, seed: int) -> list[Scene]:
         """The scenes of a split, made anew."""

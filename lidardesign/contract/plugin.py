@@ -1,10 +1,11 @@
-"""The contract of task plugins in pytest: a test that asks for `task_law` runs once per task and law.
+"""The contracts of plugins in pytest: a test that asks for `task_law` or `format_law` runs once per plugin and law.
 
-The tasks are those of the setting `lidardesign_tasks` in the project's pytest configuration, one a line, each with
-settings as `--set` takes them:
+The plugins are those of the settings `lidardesign_tasks` and `lidardesign_formats` in the project's pytest
+configuration, one a line, tasks with settings as `--set` takes them:
 
     [tool.pytest.ini_options]
     lidardesign_tasks = ["landmark train=3 test=3"]
+    lidardesign_formats = ["points"]
 
 pytest loads this module wherever lidardesign is installed, so it imports nothing of it until a test asks.
 """
@@ -19,15 +20,15 @@ import pytest
 if TYPE_CHECKING:
     from lidardesign.contract.contract import Contract
 
-SETTING = "lidardesign_tasks"
-FIXTURE = "task_law"
+# Settings by fixture.
+SETTINGS = {"task_law": "lidardesign_tasks", "format_law": "lidardesign_formats"}
 
 
-class TaskLaw:
-    """One law of the contract, to be tried on one task.
+class PluginLaw:
+    """One law of a contract, to be tried on one plugin.
 
     Arguments:
-        contract: Of the task.
+        contract: Of the plugin.
         name: The law's name.
     """
 
@@ -45,38 +46,54 @@ class TaskLaw:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Declare the setting."""
-    parser.addini(SETTING, "tasks of lidardesign whose contract is tried: NAME [KEY=VALUE]...", type="linelist")
+    """Declare the settings."""
+    parser.addini(
+        SETTINGS["task_law"], "tasks of lidardesign whose contract is tried: NAME [KEY=VALUE]...", type="linelist"
+    )
+    parser.addini(SETTINGS["format_law"], "formats of lidardesign whose contract is tried: NAME", type="linelist")
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """One test per task of the setting and law of the contract."""
-    if FIXTURE not in metafunc.fixturenames:
-        return
-    specifications = metafunc.config.getini(SETTING)
-    if not specifications:
-        raise pytest.UsageError(f"{metafunc.definition.nodeid} asks for {FIXTURE}: name tasks in {SETTING}")
-    from lidardesign.contract.contract import LAWS
+    """One test per plugin of the setting and law of its contract."""
+    for fixture in SETTINGS.keys() & set(metafunc.fixturenames):
+        setting = SETTINGS[fixture]
+        specifications = metafunc.config.getini(setting)
+        if not specifications:
+            raise pytest.UsageError(
+                f"{metafunc.definition.nodeid} asks for {fixture}: name {setting.partition('_')[2]} in {setting}"
+            )
+        from lidardesign.contract.process import statements_of
 
-    cases = [(specification, law.name) for specification in specifications for law in LAWS]
-    names = [f"{specification.split()[0]}: {law}" for specification, law in cases]
-    metafunc.parametrize(FIXTURE, cases, indirect=True, ids=names)
+        laws = [law for law, *_ in statements_of(fixture.partition("_")[0])[1:]]
+        cases = [(specification, law) for specification in specifications for law in laws]
+        names = [f"{specification.split()[0]}: {law}" for specification, law in cases]
+        metafunc.parametrize(fixture, cases, indirect=True, ids=names)
 
 
 @pytest.fixture(scope="session")
-def _task_contracts() -> dict[str, Contract]:
-    """A cache of contracts by lines of the setting, so that scenes are made once for all laws."""
+def _contracts() -> dict[str, Contract]:
+    """A cache of contracts by lines of the settings, so that scenes are made once for all laws."""
     return {}
 
 
 @pytest.fixture
-def task_law(request: pytest.FixtureRequest, _task_contracts: dict[str, Contract]) -> TaskLaw:
+def task_law(request: pytest.FixtureRequest, _contracts: dict[str, Contract]) -> PluginLaw:
     """One law of the contract of one task that the setting `lidardesign_tasks` names."""
     specification, law = request.param
-    if specification not in _task_contracts:
+    if specification not in _contracts:
         from lidardesign.contract.contract import contract_of
-        from lidardesign.registry import load_task
+        from lidardesign.task import load_task
 
         name, *overrides = shlex.split(specification)
-        _task_contracts[specification] = contract_of(load_task(name), overrides=overrides)
-    return TaskLaw(_task_contracts[specification], law)
+        _contracts[specification] = contract_of(load_task(name), overrides=overrides)
+    return PluginLaw(_contracts[specification], law)
+
+
+@pytest.fixture
+def format_law(request: pytest.FixtureRequest) -> PluginLaw:
+    """One law of the contract of one format that the setting `lidardesign_formats` names."""
+    from lidardesign.contract.contract import contract_of_format
+    from lidardesign.formats import FORMATS
+
+    name, law = request.param
+    return PluginLaw(contract_of_format(FORMATS.load(name)), law)

@@ -10,22 +10,31 @@ import os
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
-from lidardesign import registry
 from lidardesign.config import resolve
-from lidardesign.contract.law import CALL_SECONDS, LOADS, Finding, error_words, place_of, restore_random_states
-from lidardesign.errors import ConfigError, DataError, LidardesignError
+from lidardesign.contract.law import (
+    CALL_SECONDS,
+    LOADS,
+    Finding,
+    Subject,
+    Tried,
+    error_words,
+    place_of,
+    restore_random_states,
+)
+from lidardesign.errors import ConfigError, DataError, LidardesignError, PluginError
+from lidardesign.formats import FORMATS
+from lidardesign.plugins import PROBING, PluginKind
 from lidardesign.run.processes import START_SECONDS, Child, ChildError, write_line
+from lidardesign.task import TASKS
 
 if TYPE_CHECKING:
-    from lidardesign.config import RunConfig
     from lidardesign.contract.contract import Contract
-    from lidardesign.task import Task
 
 # A call beyond its limit may run this many times as long, so that its time can be reported.
 OVERTIME = 3
@@ -33,18 +42,21 @@ OVERTIME = 3
 CALLED = "called"
 FINDING_KEYS = {"law", "group", "statement", "outcome", "detail", "seconds", "figures"}
 REFUSALS = {"config": ConfigError, "data": DataError}
+KINDS: dict[str, PluginKind[Any]] = {kind.noun: kind for kind in (TASKS, FORMATS)}
+Statements = list[tuple[str, str, str]]
 
 
 @dataclass(frozen=True)
 class CheckRequest:
-    """A task to check in a child process.
+    """A plugin to check in a child process.
 
     Arguments:
-        name: The task, as `learn` takes it.
-        config_file: A YAML file of its configuration.
+        name: The plugin's name.
+        config_file: A YAML file of a task's configuration.
         overrides: `KEY=VALUE` as `--set` takes it.
         seed: Root of all random numbers.
-        limit_s: Time limit of one call of the task's code [s].
+        limit_s: Time limit of one call of the plugin's code [s].
+        noun: What it is, a task or a format.
     """
 
     name: str
@@ -52,22 +64,25 @@ class CheckRequest:
     overrides: Sequence[str] = ()
     seed: int | None = None
     limit_s: float = CALL_SECONDS
+    noun: str = "task"
 
 
 def check_in_process(request: CheckRequest) -> Iterator[Finding]:
     """The finding of each law, as soon as there is one; the first is that the plugin loads.
 
     Raises:
-        ConfigError, DataError: There is no such task, or its configuration is refused.
+        ConfigError, DataError: There is no such plugin, or a task's configuration is refused.
     """
+    statements = statements_of(request.noun)
     try:
-        offer = registry.offer_of(request.name)
-    except registry.PluginError as error:
-        yield from _all_lost(0, error_words(error))
+        offer = KINDS[request.noun].offer_of(request.name)
+    except PluginError as error:
+        yield from _all_lost(statements, error_words(error))
         return
     with tempfile.TemporaryDirectory(prefix="lidardesign-check-") as folder:
         document = {
             "folder": folder,
+            "noun": request.noun,
             "name": offer.name,
             "value": offer.value,
             "config_file": str(request.config_file) if request.config_file else None,
@@ -75,24 +90,24 @@ def check_in_process(request: CheckRequest) -> Iterator[Finding]:
             "seed": request.seed,
             "seconds": request.limit_s,
         }
-        child = Child(f"{__name__}:answer_check", document, {registry.PROBING: "1"})
+        child = Child(f"{__name__}:answer_check", document, {PROBING: "1"})
         try:
-            yield from _read_findings(child, request.limit_s)
+            yield from _read_findings(child, request.limit_s, statements)
         finally:
             child.end()
 
 
-def _read_findings(child: Child, seconds: float) -> Iterator[Finding]:
+def _read_findings(child: Child, seconds: float, statements: Statements) -> Iterator[Finding]:
     """Findings as they arrive; where the child is lost, the law under trial does not hold."""
-    for number in range(len(_statements())):
+    for number in range(len(statements)):
         found = _next_finding(child, seconds, loading=number == 0)
         if isinstance(found, str):
-            yield from _all_lost(number, found)
+            yield from _all_lost(statements[number:], found)
             return
         finding = _finding(found)
         yield finding
         if number == 0 and finding.outcome == "fail":
-            yield from _not_reached(1)
+            yield from _not_reached(statements[1:])
             return
 
 
@@ -130,22 +145,23 @@ def _finding(found: dict[str, Any]) -> Finding:
     )
 
 
-def _all_lost(number: int, reason: str) -> Iterator[Finding]:
-    """A failure of law `number` (0: the plugin loads), and findings that later laws were not reached."""
-    yield Finding(*_statements()[number], "fail", reason)
-    yield from _not_reached(number + 1)
+def _all_lost(statements: Statements, reason: str) -> Iterator[Finding]:
+    """A failure of the first law, and findings that later laws were not reached."""
+    yield Finding(*statements[0], "fail", reason)
+    yield from _not_reached(statements[1:])
 
 
-def _not_reached(number: int) -> Iterator[Finding]:
-    for one in _statements()[number:]:
+def _not_reached(statements: Statements) -> Iterator[Finding]:
+    for one in statements:
         yield Finding(*one, "skip", "not reached")
 
 
-def _statements() -> list[tuple[str, str, str]]:
-    """Name, group and statement of what comes before all laws, then of each law."""
-    from lidardesign.contract.contract import LAWS
+def statements_of(noun: str) -> Statements:
+    """Name, group and statement of what comes before all laws of a kind of plugins, then of each law."""
+    from lidardesign.contract.contract import FORMAT_LAWS, LAWS
 
-    return [LOADS, *((law.name, law.group, law.statement) for law in LAWS)]
+    laws = LAWS if noun == "task" else FORMAT_LAWS
+    return [LOADS, *((law.name, law.group, law.statement) for law in laws)]
 
 
 def answer_check(request: dict[str, Any], result: BinaryIO) -> dict[str, Any]:
@@ -164,11 +180,10 @@ def answer_check(request: dict[str, Any], result: BinaryIO) -> dict[str, Any]:
 
 def _begin(request: dict[str, Any], result: BinaryIO) -> Contract | None:
     """Import the plugin and resolve its configuration; write the finding, and return None after a failure."""
-    drawn: list[str] = []
     started = time.perf_counter()
     try:
-        task, config = _loaded(request, drawn)
-    except registry.PluginError as error:
+        plugin, subject = _loaded(request, lambda what: write_line(result, {CALLED: what}))
+    except PluginError as error:
         write_line(result, Finding(*LOADS, "fail", f"{error_words(error)}{place_of(error)}").as_dict())
         return None
     except LidardesignError as error:
@@ -179,20 +194,26 @@ def _begin(request: dict[str, Any], result: BinaryIO) -> Contract | None:
         return None
     # imported late: a plugin that fails to load is reported without the libraries that the laws need
     from lidardesign.contract.contract import Contract
-    from lidardesign.contract.law import Subject
 
-    version = f"version {task.api_version} of the task interface"
-    loaded = Finding(*LOADS, "pass", f"{version}, {type(task).__module__}", time.perf_counter() - started)
+    version = f"version {plugin.api_version} of the {request['noun']} interface"
+    loaded = Finding(*LOADS, "pass", f"{version}, {type(plugin).__module__}", time.perf_counter() - started)
     write_line(result, loaded.as_dict())
-    return Contract(Subject(task, config, request["seconds"], drawn, lambda what: write_line(result, {CALLED: what})))
+    return Contract(subject)
 
 
-def _loaded(request: dict[str, Any], drawn: list[str]) -> tuple[Task, RunConfig]:
-    offer = EntryPoint(request["name"], request["value"], registry.GROUP)
+def _loaded(request: dict[str, Any], on_call: Callable[[str], None]) -> tuple[Any, Tried]:
+    """The plugin, and it with all that it is tried with."""
+    drawn: list[str] = []
+    kind, conduct = KINDS[request["noun"]], (request["seconds"], drawn, on_call)
     with restore_random_states(drawn, "import"):
-        task = registry.import_task(offer)
+        plugin, _ = kind.imported(EntryPoint(request["name"], request["value"], kind.group))
+    if kind is FORMATS:
+        from lidardesign.contract.formats import FormatSubject
+
+        return plugin, FormatSubject(plugin, *conduct)
     config_file = Path(request["config_file"]) if request["config_file"] else None
     with restore_random_states(drawn, "space"):
-        return task, resolve(
-            task, preset="draft", config_file=config_file, overrides=request["overrides"], seed=request["seed"]
+        config = resolve(
+            plugin, preset="draft", config_file=config_file, overrides=request["overrides"], seed=request["seed"]
         )
+    return plugin, Subject(plugin, config, *conduct)

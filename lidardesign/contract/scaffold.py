@@ -7,11 +7,11 @@ from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
 
-from lidardesign import __version__, registry
+from lidardesign import __version__
 from lidardesign.errors import ConfigError, DataError, page
 from lidardesign.run.files import is_temporary, write_folder
 from lidardesign.run.inputs import UNFINISHED, unfinished_names
-from lidardesign.task import API_VERSION
+from lidardesign.task import API_VERSION, TASKS
 
 NAME = re.compile(r"[a-z][a-z0-9]*(_[a-z0-9]+)*")
 LONGEST_NAME = 30
@@ -50,7 +50,7 @@ def new_task(name: str, folder: Path | None = None) -> list[Path]:
             allowed=f"small letters, digits and single underscores, up to {LONGEST_NAME}, such as landmark or "
             "drone_landing",
         )
-    if name in registry.task_names():
+    if name in TASKS.names():
         raise ConfigError(f"a task {name!r} is installed already", where="NAME", hint="choose another name")
     if find_spec(f"lidardesign_{name}") is not None:
         raise ConfigError(f"a module lidardesign_{name} is installed already", where="NAME", hint="choose another name")

@@ -28,8 +28,8 @@ from lidardesign.contract.law import (
     restore_random_states,
 )
 from lidardesign.errors import ConfigError, LidardesignError
+from lidardesign.plugins import plugin_guard
 from lidardesign.rays.information import informs_rays
-from lidardesign.registry import plugin_guard
 from lidardesign.run.processes import ChildError, ask
 from lidardesign.space import DesignSpace
 from lidardesign.task import Split, scenes_of

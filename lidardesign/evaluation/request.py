@@ -7,19 +7,19 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
 from lidardesign.errors import ConfigError, PluginError
-from lidardesign.rays.training_scenes import TrainingScenes
-from lidardesign.registry import plugin_guard
-from lidardesign.samples import Samples
-from lidardesign.scenes.scene import Scene
+from lidardesign.evaluation.mounting import MountError
+from lidardesign.plugins import plugin_guard
 from lidardesign.problem.method import METHODS
 from lidardesign.problem.world import World
-from lidardesign.evaluation.mounting import MountError
+from lidardesign.rays.training_scenes import TrainingScenes
+from lidardesign.samples import Samples
+from lidardesign.scenes.scene import Scene
 from lidardesign.scoring.scene_scores import TrainingScorer
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design import DesignSpec
@@ -28,6 +28,8 @@ from lidardesign.space import DesignSpace
 from lidardesign.task import Metric, Task, conditions_of, metric_of, mount_of
 from lidardesign.workers import Starmap
 
+# In the place of names: no baselines at all.
+NONE = "none"
 # What stands beside every design, asked for or not.
 ALWAYS = ("uniform", "random", "bounding", "silhouette", "greedy")
 # Fixed patterns of more rays are scored without baselines, unless their number is asked for: some have 100,000.

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 
 from lidardesign.estimates import HALF_INTERVAL, Estimate, Interval, as_documents, paired_difference
-from lidardesign.run.arrays import csv_table
-from lidardesign.run.files import write_atomic
-from lidardesign.methods.cma import SearchRecord
 from lidardesign.evaluation.entries import EffectSummary, StrongestBaseline
 from lidardesign.evaluation.mounting import MountError
+from lidardesign.methods.cma import SearchRecord
+from lidardesign.run.arrays import csv_table
+from lidardesign.run.files import write_atomic
 from lidardesign.scoring.sweep import Accuracy
 from lidardesign.task import Metric
 

@@ -12,15 +12,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidardesign.errors import ConfigError, InfeasibleError
+from lidardesign.errors import InfeasibleError
 from lidardesign.evaluation.entries import SINGLE, Entry
 from lidardesign.evaluation.request import EvaluationRequest
+from lidardesign.methods.cma import SearchRecord
 from lidardesign.problem.method import METHODS, Method, design_by, refusal_of
 from lidardesign.problem.problem import NOTHING_FITS, Comparison, Fired, Problem
 from lidardesign.run.clock import phase
 from lidardesign.scenes.rays import Rays
 from lidardesign.scoring.fired import ONE_DEVICE, Devices, Positions, fired
-from lidardesign.methods.cma import SearchRecord
 from lidardesign.sensors.adaptive import AdaptiveRays
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.pattern import TRAVELLED
@@ -108,9 +108,7 @@ def _add(request: EvaluationRequest, found: Rivals, asked: Asked) -> None:
         line = f"{method.name} is left out: {refusal}"
         found.refused += [line] if refusal and line not in found.refused else []
         return
-    rays_of: Callable[[DesignSpec], Positions] = partial(
-        fired, conditions=request.conditions, planner=request.planner
-    )
+    rays_of: Callable[[DesignSpec], Positions] = partial(fired, conditions=request.conditions, planner=request.planner)
     search, redraw = None, None
     try:
         result = design_by(method, problem)

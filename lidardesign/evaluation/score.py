@@ -26,17 +26,17 @@ from lidardesign.estimates import (
     relative_difference,
     worst_tenth,
 )
-from lidardesign.limits import MOST_RAYS
-from lidardesign.numerics import ROUNDING
-from lidardesign.registry import plugin_guard
-from lidardesign.run.clock import Progress, phase
-from lidardesign.scenes.scene import Scene, group_numbers
-from lidardesign.scenes.triangles import SecondCasts
 from lidardesign.evaluation.entries import Entry, design_entries, effect_notes, effect_summaries, strongest_baseline
 from lidardesign.evaluation.mounting import MountError
 from lidardesign.evaluation.request import EvaluationRequest, fired_numbers, missing_row_notes
-from lidardesign.evaluation.rivals import Rivals, rivals_of
 from lidardesign.evaluation.results import Audit, Evaluation, Mounting, Paired, Row, audit_rows, middle_rays
+from lidardesign.evaluation.rivals import Rivals, rivals_of
+from lidardesign.limits import MOST_RAYS
+from lidardesign.numerics import ROUNDING
+from lidardesign.plugins import plugin_guard
+from lidardesign.run.clock import Progress, phase
+from lidardesign.scenes.scene import Scene, group_numbers
+from lidardesign.scenes.triangles import SecondCasts
 from lidardesign.scoring.fired import Positions, without_each
 from lidardesign.scoring.scene_scores import score_scenes, silent_notes
 from lidardesign.sensors.adaptive import AdaptiveRays
@@ -282,9 +282,7 @@ def _bandwidth_pairs(rows: Sequence[Row], matched: Sequence[Row], metric: Metric
     return [_pair(designs[row.matched_to, row.matched_rays], row, metric, row.rays) for row in matched]
 
 
-def _notes(
-    request: EvaluationRequest, entries: Sequence[Entry], rivals: Rivals, matched: Sequence[Row]
-) -> list[str]:
+def _notes(request: EvaluationRequest, entries: Sequence[Entry], rivals: Rivals, matched: Sequence[Row]) -> list[str]:
     positions = max(len(entry.positions) for entry in entries if not isinstance(entry.positions, AdaptiveRays))
     notes = missing_row_notes(request.designs, request.rays, request.alone)
     if positions > 1:

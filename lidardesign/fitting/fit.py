@@ -33,10 +33,10 @@ from lidardesign.fitting.result import FitResult
 from lidardesign.formats.designs import relative_folder
 from lidardesign.mixture.fit import FitProblem, FittedSensors, fit_sensors
 from lidardesign.mixture.support import LEAST_SAMPLES, MOVED_SAMPLES, Retarget, at_condition, condition_text
+from lidardesign.plugins import plugin_guard
 from lidardesign.rays.information import FEW_SCENES, checked_information
 from lidardesign.rays.proposals import nearest_samples
 from lidardesign.rays.training_scenes import CHOICE, TrainingScenes
-from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.run.manifest import read_manifest, versions
 from lidardesign.run.yaml import dump_yaml, merged, parse_yaml

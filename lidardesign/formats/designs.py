@@ -16,6 +16,7 @@ from pathlib import Path
 
 from lidardesign.constraints.document import Constraints
 from lidardesign.errors import ConfigError, DataError, LidardesignError
+from lidardesign.formats import FORMATS
 from lidardesign.formats.mjcf import read_mjcf
 from lidardesign.formats.ray_lists import (
     QUERY_COLUMN,
@@ -27,6 +28,7 @@ from lidardesign.formats.ray_lists import (
 )
 from lidardesign.formats.rig import Rig, number_of, rig_design
 from lidardesign.formats.sdf import read_sdf
+from lidardesign.plugins import plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.run.inputs import DESIGN, RAY_TABLE, read_head
 from lidardesign.run.manifest import changed_since_recorded
@@ -39,6 +41,8 @@ from lidardesign.space import RANGE
 
 CSV, NPZ, XML = "CSV", "NPZ", "XML"
 KINDS = {".csv": CSV, ".npz": NPZ, ".xml": XML, ".mjcf": XML, ".sdf": XML, ".world": XML}
+# Suffixes of files that are read here, so that no format of another package is asked.
+KNOWN = {"", ".yaml", ".yml", ".json", *KINDS}
 ALLOWED = {
     CSV: "a header in line 1 that names the columns, then one ray per line, separated by commas",
     NPZ: "an archive that numpy.savez or export --format npz writes",
@@ -75,6 +79,12 @@ def load_design(path: Path, reach_m: float | None = None) -> DesignSpec:
         ConfigError: The file is not YAML, or not a design (exit 2).
     """
     head = read_head(path, RAY_TABLE, hint="give a design file, such as RUN/designs/NAME.yaml")
+    name = path.suffix.removeprefix(".")
+    if path.suffix.lower() not in KNOWN and name in FORMATS.names() and not FORMATS.is_shipped(name):
+        foreign, facts = FORMATS.loaded(name)
+        if facts["reads"]:
+            with plugin_guard(name, "format"):
+                return rig_design(foreign.read(path), path, reach_m)
     rig = read_rig(path, head)
     if rig is not None:
         return rig_design(rig, path, reach_m)

@@ -29,6 +29,7 @@ from pathlib import Path
 import numpy as np
 
 from lidardesign.errors import ConfigError, DataError
+from lidardesign.formats import Format
 from lidardesign.formats.ray_lists import LOST, row_of_numbers
 from lidardesign.numerics import COARSE_SLACK, EPSILON, ROUNDING, SLACK
 from lidardesign.run.arrays import csv_rows
@@ -161,7 +162,7 @@ class Position:
     own_travel_deg: float
 
 
-def write_galvo(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
+def write_galvo(design: DesignSpec, rays: Rays, path: Path, _: object = None) -> list[str]:
     """Write the file, atomically; returns a summary and notes of what the format cannot hold.
 
     Raises:
@@ -179,6 +180,16 @@ def write_galvo(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     write_atomic(path, "\n".join(lines) + "\n")
     rounded = "gates are whole picoseconds (0.15 mm), opened outward; firing times follow from the order of the rows"
     return [*_summary(positions), *LOST, rounded]
+
+
+GALVO = Format(
+    "galvo",
+    ".galvo.csv",
+    "mirror angles in the order of least travel, gates in ps: +-20 degrees per axis",
+    write_galvo,
+    reader="a script that drives two mirrors and a gated detector",
+    checked="read by `capture`",
+)
 
 
 def plan(design: DesignSpec, rays: Rays) -> list[Position]:

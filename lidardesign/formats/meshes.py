@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lidardesign.formats import Format
 from lidardesign.formats.names import identifier, numbers
 from lidardesign.numerics import unit_vectors
 from lidardesign.run.files import write_atomic, write_folder
@@ -49,7 +50,7 @@ PARTS = 12
 LONGEST_NAME = 60
 
 
-def write_ply(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
+def write_ply(design: DesignSpec, rays: Rays, path: Path, _: object = None) -> list[str]:
     """Write the folder; returns notes of what the format cannot hold."""
     comments = [
         f"comment sensor {index} {json.dumps(one.name[:LONGEST_NAME])}" for index, one in enumerate(design.sensors)
@@ -62,6 +63,17 @@ def write_ply(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     if len(seen) < len(design.sensors):
         notes.append(f"{len(design.sensors) - len(seen)} of {len(design.sensors)} sensors have no width, so no frustum")
     return [*notes, *_region_notes([sensor for _, sensor in seen], "frusta")]
+
+
+PLY = Format(
+    "ply",
+    ".ply.d",
+    "rays as points, beams as edges, fields of view as surfaces",
+    write_ply,
+    reader="CloudCompare, Blender, MeshLab",
+    checked="loaded by trimesh; names as CloudCompare and Blender know them",
+    is_folder=True,
+)
 
 
 def _region_notes(sensors: Sequence[Sensor], drawn: str) -> list[str]:
@@ -151,7 +163,7 @@ FACETS = np.array([(0, 1, 2), (0, 2, 3), (0, 3, 4), (0, 4, 1), (1, 4, 3), (1, 3,
 KEYWORDS = ("solid", "facet", "loop", "vertex")
 
 
-def write_stl(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
+def write_stl(design: DesignSpec, rays: Rays, path: Path, _: object = None) -> list[str]:
     """Write the file, atomically; returns notes of what the format cannot hold."""
     write_atomic(path, "".join(_solid(index, sensor) for index, sensor in enumerate(design.sensors)))
     return [
@@ -159,6 +171,17 @@ def write_stl(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
         "sensors only: rays, fields of view, gates and weights are lost",
         *_region_notes(design.sensors, "solids"),
     ]
+
+
+STL = Format(
+    "stl",
+    ".stl",
+    "mounting positions as small solids, in millimetres",
+    write_stl,
+    reader="CAD programs",
+    checked="loaded by trimesh as closed solids",
+    holds=frozenset(),
+)
 
 
 def _solid(index: int, sensor: Sensor) -> str:

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from lidardesign.formats import Format
 from lidardesign.formats.mounts import quaternion
 from lidardesign.formats.names import distinct, document, element, identifier
 from lidardesign.formats.robots import WORLD, fixed_link
@@ -127,7 +128,7 @@ def mounted_parts(design: DesignSpec) -> list[MountedPart]:
     return [MountedPart(*one) for one in zip(names, design.sensors, parts_of(design), strict=True)]
 
 
-def write_mounts(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
+def write_mounts(design: DesignSpec, rays: Rays, path: Path, _: object = None) -> list[str]:
     """Write the folder, each file atomically; returns notes of what the format cannot hold."""
     mounted = mounted_parts(design)
     parent = WORLD if design.mount is None else design.mount
@@ -158,6 +159,18 @@ def write_mounts(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
             f"the part files of {', '.join(missing)} are not available: poses are those of the middles of their fields"
         )
     return [*notes, "sensors only: rays are lost; --format csv lists them"]
+
+
+MOUNTS = Format(
+    "mounts",
+    ".mounts",
+    "a page to mount from, the same as CSV, and ROS frames",
+    write_mounts,
+    reader="people who build it; ROS",
+    checked="a design is built from the CSV in MuJoCo: all ranges agree",
+    holds=frozenset(),
+    is_folder=True,
+)
 
 
 def _transforms(mounted: Sequence[MountedPart], parent: str) -> list[str]:

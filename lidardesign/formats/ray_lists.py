@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from lidardesign.errors import DataError
+from lidardesign.formats import ADAPTIVE, RAYS, Format
 from lidardesign.formats.rig import MOST_SENSORS, Rig, RigSensor, number_of
 from lidardesign.limits import MOST_RAYS
 from lidardesign.numerics import COARSE_SLACK, SLACK
@@ -259,7 +260,7 @@ def ray_columns(rays: Rays) -> dict[str, np.ndarray]:
     return dict(zip((*ORIGIN, *VECTOR, *RADIANS, START, END, SENSOR, TIME), columns, strict=True))
 
 
-def write_csv(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
+def write_csv(design: DesignSpec, rays: Rays, path: Path, _: object = None) -> list[str]:
     """Write one ray per row, every number with all its digits; returns notes of what the format cannot hold.
 
     Of patterns that follow what they see each row names its pattern, and the rule follows as comments.
@@ -276,7 +277,19 @@ def write_csv(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     return list(LOST)
 
 
-def write_npz(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
+CSV = Format(
+    "csv",
+    ".csv",
+    "one ray per row: origin, direction, angles, gate, time",
+    write_csv,
+    reader="anything that reads CSV; `evaluate` and `fit` too",
+    checked="read by numpy",
+    holds=frozenset({RAYS, ADAPTIVE}),
+    read=read_ray_csv,
+)
+
+
+def write_npz(design: DesignSpec, rays: Rays, path: Path, _: object = None) -> list[str]:
     """Write an array per column, names of sensors, and a rule of patterns; returns notes of what is lost."""
     buffer = io.BytesIO()
     names = np.array([sensor.name for sensor in design.sensors], dtype=np.str_)
@@ -284,6 +297,18 @@ def write_npz(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     np.savez(buffer, **columns, **rule, **{NAMES: names})
     write_atomic(path, buffer.getvalue())
     return list(LOST)
+
+
+NPZ = Format(
+    "npz",
+    ".npz",
+    "the same columns as numpy arrays",
+    write_npz,
+    reader="numpy",
+    checked="read by numpy",
+    holds=frozenset({RAYS, ADAPTIVE}),
+    read=read_ray_npz,
+)
 
 
 def pattern_columns(design: DesignSpec, rays: Rays) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
@@ -429,7 +454,7 @@ def _sensor(row: dict[str, float], index: int, where: str) -> Sensor:
     )
 
 
-def write_sensor_csv(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
+def write_sensor_csv(design: DesignSpec, rays: Rays, path: Path, _: object = None) -> list[str]:
     """Write a sensor table with its header, atomically, without any rays; returns what the table cannot hold."""
     table: list[Sequence[str]] = [SENSOR_COLUMNS]
     lost = {
@@ -467,3 +492,14 @@ def write_sensor_csv(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
         table.append([repr(float(value)) for value in row])
     write_atomic(path, csv_table(table))
     return [*notes, f"the {len(rays)} rays are lost"] if len(rays) else notes
+
+
+SENSORS_CSV = Format(
+    "sensors-csv",
+    ".sensors.csv",
+    "one sensor per row, the 16 columns of the research code",
+    write_sensor_csv,
+    reader="the research code of the paper",
+    checked="read as a design; the columns are those of its own files",
+    holds=frozenset(),
+)

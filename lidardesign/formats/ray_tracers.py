@@ -31,6 +31,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from lidardesign.formats import RATE, RAYS, Format, WriteOptions
 from lidardesign.formats.mounts import (
     Mount,
     Place,
@@ -66,14 +67,14 @@ NS_PER_S = 1e9
 MM_PER_M = 1000
 
 
-def write_helios(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> list[str]:
+def write_helios(design: DesignSpec, rays: Rays, path: Path, options: WriteOptions) -> list[str]:
     """Write the folder; returns notes of what the format cannot hold.
 
     Raises:
         DataError: The design has no rays, or the folder cannot be written.
     """
     require_rays(design, rays, "a HELIOS++ scanner")
-    pulse_hz = max(round(rate_hz), 1)
+    pulse_hz = max(round(options.rate_hz), 1)
     mounted = mounts(design, rays)
     scanners = element("document")
     surveys = {}
@@ -112,9 +113,21 @@ def write_helios(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> 
             f"gates of {near} of {len(rays)} rays start below {LEAST_START_M:g} m: they start there, for HELIOS++ 2 "
             "sends no power through a gate from 0"
         )
-    if pulse_hz != rate_hz:
-        notes.append(f"{rate_hz:g} frames per second became {pulse_hz}: HELIOS++ takes whole numbers only")
+    if pulse_hz != options.rate_hz:
+        notes.append(f"{options.rate_hz:g} frames per second became {pulse_hz}: HELIOS++ takes whole numbers only")
     return [*notes, *design_losses(design, mounted)]
+
+
+HELIOS = Format(
+    "helios",
+    ".helios",
+    "a scanner per sensor with a channel per ray, and surveys of one frame each",
+    write_helios,
+    reader="HELIOS++",
+    checked="valid by schemas of its fields; a twin of HELIOS++ fires the rays and finds their echoes",
+    holds=frozenset({RAYS, RATE}),
+    is_folder=True,
+)
 
 
 def _add_scanner(root: Element, mount: Mount, rays: Rays, pulse_hz: int) -> None:
@@ -144,7 +157,7 @@ SAMPLES = 64
 DEPTH = 2
 
 
-def write_mitsuba(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
+def write_mitsuba(design: DesignSpec, rays: Rays, path: Path, _: object = None) -> list[str]:
     """Write the folder; returns notes of what the format cannot hold.
 
     Raises:
@@ -169,6 +182,17 @@ def write_mitsuba(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     if len(found) > len(mounted):
         notes.append(f"rays of {len(mounted)} sensors start at {len(found)} places: each is a scene of its own")
     return [*notes, *design_losses(design, mounted)]
+
+
+MITSUBA = Format(
+    "mitsuba",
+    ".mitsuba",
+    "a scene per sensor: gated film, rays as radiancemeters, a flash beside them",
+    write_mitsuba,
+    reader="Mitsuba 3 with mitransient",
+    checked="rendered by them: light comes back in the bin of its range",
+    is_folder=True,
+)
 
 
 def _gate_m(rays: Rays, place: Place) -> tuple[float, float]:
@@ -220,7 +244,7 @@ MODEL, PATTERN, RANGES, TIMES = "model.sdf", ".mat3x4f", ".range2f", ".time1f"
 MS_PER_S = 1000.0
 
 
-def write_rgl(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> list[str]:
+def write_rgl(design: DesignSpec, rays: Rays, path: Path, options: WriteOptions) -> list[str]:
     """Write the folder; returns notes of what the format cannot hold.
 
     Raises:
@@ -233,7 +257,7 @@ def write_rgl(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> lis
     child(model, "static", text=True)
     link = child(model, "link", name="lidar")
     files = {}
-    times_ms = MS_PER_S * fire_times_s(rays, rate_hz)
+    times_ms = MS_PER_S * fire_times_s(rays, options.rate_hz)
     for mount in mounted:
         files[f"{mount.name}{TIMES}"] = times_ms[mount.ray].astype("<f4").tobytes()
         files[f"{mount.name}{PATTERN}"] = _matrices(mount, rays.subset(mount.ray)).astype("<f4").tobytes()
@@ -247,7 +271,7 @@ def write_rgl(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> lis
         child(limits, "min", text=start)
         child(limits, "max", text=end)
         settings = {
-            "update_rate": float(rate_hz),
+            "update_rate": float(options.rate_hz),
             "update_on_paused_sim": False,
             "topic": f"rgl/{mount.name}",
             "frame": mount.name,
@@ -267,6 +291,18 @@ def write_rgl(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> lis
     names = [design.name, *(mount.sensor.name for mount in mounted)]
     written = [identifier(design.name), *(mount.name for mount in mounted)]
     return [*notes, *renamed_note(names, written), *design_losses(design, mounted)]
+
+
+RGL = Format(
+    "rgl",
+    ".rgl",
+    "a pattern of float32 ray poses per sensor, and the model with the plugin",
+    write_rgl,
+    reader="Robotec GPU Lidar and its Gazebo plugin",
+    checked="parsed by libsdformat; a twin reads patterns as the plugin does",
+    holds=frozenset({RAYS, RATE}),
+    is_folder=True,
+)
 
 
 def _matrices(mount: Mount, rays: Rays) -> np.ndarray:

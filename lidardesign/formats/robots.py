@@ -34,7 +34,8 @@ from xml.etree.ElementTree import Element, fromstring
 import numpy as np
 
 from lidardesign.errors import DataError
-from lidardesign.formats.mjcf import EXPORTED, USER_VALUES
+from lidardesign.formats import EVERY_STEP, RATE, RAYS, ROBOT, Format, WriteOptions
+from lidardesign.formats.mjcf import EXPORTED, USER_VALUES, read_mjcf
 from lidardesign.formats.mounts import (
     Mount,
     channel_mounts,
@@ -56,7 +57,6 @@ from lidardesign.numerics import SLACK
 from lidardesign.run.files import write_atomic
 from lidardesign.scenes.mujoco_models import RobotFile, load_model, mujoco_warnings, seen_geoms
 from lidardesign.scenes.rays import Rays
-from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design import DesignSpec
 
 WORLD = "world"
@@ -65,21 +65,15 @@ SITE_SIZE_M = 0.002
 UNSEEN = "lidardesign_unseen"
 
 
-def write_mjcf(
-    design: DesignSpec,
-    rays: Rays,
-    path: Path,
-    rate_hz: float = Bandwidth().rate_hz,
-    robot: RobotFile | None = None,
-) -> list[str]:
+def write_mjcf(design: DesignSpec, rays: Rays, path: Path, options: WriteOptions) -> list[str]:
     """Write the model, atomically; returns notes of what the format cannot hold.
 
     Arguments:
         design: The design; with a robot its sensors are on the body that it is mounted on, else in the world.
         rays: Its rays.
         path: The file.
-        rate_hz: How often rangefinders fire [Hz]; 0: at every step.
-        robot: A MuJoCo model, MJCF or URDF; the file is a copy of it with the sensors added.
+        options: How often rangefinders fire [Hz], 0: at every step; and a robot's MuJoCo model, MJCF or URDF, of which
+            the file is a copy with the sensors added.
 
     Raises:
         DataError: The robot's model cannot be read, or has no such body.
@@ -87,8 +81,8 @@ def write_mjcf(
     mounted = mounts(design, rays)
     place, sensors, notes = element("worldbody"), element("sensor"), design_losses(design, mounted)
     model, taken = element("mujoco", {"model": design.name}, [place, sensors]), [WORLD]
-    if robot is not None:
-        model, place, sensors, said = _robot_with(design.mount, robot, path)
+    if options.robot is not None:
+        model, place, sensors, said = _robot_with(design.mount, options.robot, path)
         sites = [EXPORTED.fullmatch(one.get("name", "")) for one in model.iter("site")]
         taken += [one.get("name", "") for one in model.iter("body")] + [one.group(1) for one in sites if one]
         notes += [
@@ -103,7 +97,7 @@ def write_mjcf(
             place.extend(_sites(rays.origin_m[mount.ray], rays.direction[mount.ray], site[mount.ray]))
         else:
             place.append(_body(mount, name, rays, site[mount.ray]))
-    sensors.extend(_rangefinder(str(site[ray]), rays, ray, rate_hz) for ray in range(len(rays)))
+    sensors.extend(_rangefinder(str(site[ray]), rays, ray, options.rate_hz) for ray in range(len(rays)))
     write_atomic(path, document(model))
     late = rays.gate_m[rays.gate_m[:, 0] > 0, 0]
     if len(late):
@@ -113,12 +107,24 @@ def write_mjcf(
         )
     if place.tag == "body":
         notes.append(f"rays ignore the geoms of {design.mount!r}, the body that carries the sensors")
-    when = f"at {rate_hz:g} Hz; in between they keep what they read" if rate_hz else "at every step"
+    when = f"at {options.rate_hz:g} Hz; in between they keep what they read" if options.rate_hz else "at every step"
     return [
         *notes,
         f"rangefinders fire {when}",
         "a reading equal to the cutoff is a hit at or beyond the end of the gate; a negative one is no hit",
     ]
+
+
+MJCF = Format(
+    "mjcf",
+    ".mjcf.xml",
+    "a rangefinder site per ray",
+    write_mjcf,
+    reader="MuJoCo",
+    checked="loaded and run in MuJoCo: its distances agree with ours",
+    holds=frozenset({RAYS, RATE, EVERY_STEP, ROBOT}),
+    read=read_mjcf,
+)
 
 
 def _robot_with(mount: str | None, robot: RobotFile, path: Path) -> tuple[Element, Element, Element, tuple[str, ...]]:
@@ -196,13 +202,24 @@ BESIDE_DEG = 0.64
 NEAREST_M = 0.001
 
 
-def write_sdf(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
+def write_sdf(design: DesignSpec, rays: Rays, path: Path, options: WriteOptions) -> list[str]:
     """Write the model, atomically; returns notes of what the format cannot hold."""
     design, rays, mounted = channel_mounts(design, rays)
-    link = element("link", {"name": LINK}, [sensor_element(one, rate_hz, posed=True) for one in mounted])
+    link = element("link", {"name": LINK}, [sensor_element(one, options.rate_hz, posed=True) for one in mounted])
     model = element("model", {"name": identifier(design.name)}, [element("static", text="true"), link])
     write_atomic(path, document(element("sdf", {"version": "1.9"}, [model])))
     return sdf_losses(design, mounted, rays)
+
+
+SDF = Format(
+    "sdf",
+    ".sdf",
+    "a gpu_lidar per sensor, on even grids",
+    write_sdf,
+    reader="Gazebo",
+    checked="parsed by libsdformat without a warning, all values compared; its pixels in a twin",
+    holds=frozenset({RAYS, RATE}),
+)
 
 
 def sdf_losses(design: DesignSpec, mounted: Sequence[Mount], rays: Rays) -> list[str]:
@@ -264,13 +281,24 @@ BASE = "lidar_base"
 BASE_MASS_KG, BASE_INERTIA_KG_M2 = 0.1, 0.0001
 
 
-def write_urdf(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
+def write_urdf(design: DesignSpec, rays: Rays, path: Path, options: WriteOptions) -> list[str]:
     """Write the description, atomically; returns notes of what the format cannot hold."""
     design, rays, mounted = channel_mounts(design, rays)
-    parts = [part for one in mounted for part in mounted_parts(one, rate_hz, parent=BASE)]
+    parts = [part for one in mounted for part in mounted_parts(one, options.rate_hz, parent=BASE)]
     write_atomic(path, document(element("robot", {"name": identifier(design.name)}, [*_base(), *parts])))
     mass = f"{BASE} has a nominal mass of {BASE_MASS_KG:g} kg, without which Gazebo would leave out the sensors"
     return [*urdf_losses(design, mounted, rays), mass]
+
+
+URDF = Format(
+    "urdf",
+    ".urdf",
+    "a fixed link per sensor, with Gazebo's gpu_lidar",
+    write_urdf,
+    reader="ROS, robot_state_publisher",
+    checked="parsed by check_urdf; sensors by libsdformat",
+    holds=frozenset({RAYS, RATE}),
+)
 
 
 def urdf_losses(design: DesignSpec, mounted: Sequence[Mount], rays: Rays) -> list[str]:
@@ -321,14 +349,26 @@ def fixed_link(
 MACRO = "xacro:macro"
 
 
-def write_xacro(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
+def write_xacro(design: DesignSpec, rays: Rays, path: Path, options: WriteOptions) -> list[str]:
     """Write the macro, atomically; returns its usage and notes of what the format cannot hold."""
     design, rays, mounted = channel_mounts(design, rays)
     name = identifier(design.name)
-    parts = [part for one in mounted for part in mounted_parts(one, rate_hz, parent="${parent}", prefix="${prefix}")]
+    placed = {"parent": "${parent}", "prefix": "${prefix}"}
+    parts = [part for one in mounted for part in mounted_parts(one, options.rate_hz, **placed)]
     macro = element(MACRO, {"name": name, "params": "parent prefix:=''"}, parts)
     write_atomic(
         path, document(element("robot", {"xmlns:xacro": "http://www.ros.org/wiki/xacro", "name": name}, [macro]))
     )
     usage = f'include it and call <xacro:{name} parent="base_link"/>: poses are relative to the parent'
     return [usage, *urdf_losses(design, mounted, rays)]
+
+
+XACRO = Format(
+    "xacro",
+    ".urdf.xacro",
+    "the same as a macro that mounts it on a robot",
+    write_xacro,
+    reader="ROS, xacro",
+    checked="expanded by xacro and parsed by check_urdf",
+    holds=frozenset({RAYS, RATE}),
+)

@@ -38,6 +38,7 @@ from typing import Any
 import numpy as np
 
 from lidardesign.errors import ConfigError, check_number
+from lidardesign.formats import RATE, RAYS, Format, WriteOptions
 from lidardesign.formats.mounts import (
     EvenGrid,
     Mount,
@@ -56,7 +57,6 @@ from lidardesign.formats.names import renamed_note
 from lidardesign.numerics import FULL_TURN, HALF_DIGITS
 from lidardesign.run.files import write_atomic
 from lidardesign.scenes.rays import Rays
-from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.space import angles
 
@@ -69,19 +69,19 @@ SLOWEST_HZ, FASTEST_HZ = 2.5, 2000.0
 TRIED_FIELDS, TRIED_RATES = (sorted(range(-most, most + 1), key=abs) for most in (4000, 3))
 
 
-def write_carla(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
+def write_carla(design: DesignSpec, rays: Rays, path: Path, options: WriteOptions) -> list[str]:
     """Write the file, atomically; returns notes of what the format cannot hold.
 
     Raises:
         ConfigError: A frame rate that Unreal's frames do not have; at those, CARLA's whole numbers of points per second
             are the rays of a frame.
     """
-    check_number(rate_hz, "--rate-hz", SLOWEST_HZ, FASTEST_HZ)
+    check_number(options.rate_hz, "--rate-hz", SLOWEST_HZ, FASTEST_HZ)
     design, rays, mounted = channel_mounts(design, rays)
     document = {
         "design": design.name,
-        "fixed_delta_seconds": 1 / rate_hz,
-        "sensors": [_blueprint(one, rate_hz) for one in mounted],
+        "fixed_delta_seconds": 1 / options.rate_hz,
+        "sensors": [_blueprint(one, options.rate_hz) for one in mounted],
     }
     write_atomic(path, json.dumps(document, indent=1) + "\n")
     notes = grid_sensor_losses(design, mounted, rays)
@@ -92,6 +92,17 @@ def write_carla(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Ban
             f"{min(late):.3g} to {max(late):.3g} m"
         )
     return [*notes, "every frame has all rays once where the world's fixed_delta_seconds is that of the file"]
+
+
+CARLA = Format(
+    "carla",
+    ".carla.json",
+    "attributes and transform of a ray_cast lidar per sensor",
+    write_carla,
+    reader="a script that sets blueprint attributes",
+    checked="names and types against CARLA's documented ones; its sweep in a twin",
+    holds=frozenset({RAYS, RATE}),
+)
 
 
 def _blueprint(mount: Mount, rate_hz: float) -> dict[str, Any]:
@@ -159,7 +170,7 @@ MICROSECONDS_PER_S = 1e6
 NANOSECONDS_PER_S = 10**9
 
 
-def write_osi(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> list[str]:
+def write_osi(design: DesignSpec, rays: Rays, path: Path, options: WriteOptions) -> list[str]:
     """Write the file, atomically; returns notes of what the format cannot hold.
 
     Raises:
@@ -168,9 +179,9 @@ def write_osi(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> lis
     require_rays(design, rays, "a lidar's configuration")
     # uint32 there: every allowed frame rate has fewer microseconds in a frame; the last are not rounded into
     # the next frame
-    times_us = np.rint(fire_times_s(rays, rate_hz) * MICROSECONDS_PER_S)
-    times_us = np.minimum(times_us, math.ceil(MICROSECONDS_PER_S / rate_hz) - 1)
-    cycle_ns = round(NANOSECONDS_PER_S / rate_hz)
+    times_us = np.rint(fire_times_s(rays, options.rate_hz) * MICROSECONDS_PER_S)
+    times_us = np.minimum(times_us, math.ceil(MICROSECONDS_PER_S / options.rate_hz) - 1)
+    cycle_ns = round(NANOSECONDS_PER_S / options.rate_hz)
     mounted = mounts(design, rays)
     found = places(mounted, rays)
     seconds, nanoseconds = divmod(cycle_ns, NANOSECONDS_PER_S)
@@ -191,6 +202,17 @@ def write_osi(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> lis
     if len(found) > len(mounted):
         notes.append(f"rays of {len(mounted)} sensors start at {len(found)} places: each is a configuration of its own")
     return [*notes, *design_losses(design, mounted)]
+
+
+OSI = Format(
+    "osi",
+    ".osi.json",
+    "a lidar configuration per sensor: mounting position, unit vectors, microseconds",
+    write_osi,
+    reader="sensor models and simulators of ASAM OSI",
+    checked="parsed by protobuf, with ASAM's own bindings where they are",
+    holds=frozenset({RAYS, RATE}),
+)
 
 
 def _configuration(number: int, place: Place, rays: Rays, times_us: np.ndarray) -> dict[str, Any]:
@@ -230,16 +252,18 @@ SCHEMAS = ("OmniSensorGenericLidarCoreAPI", "OmniSensorGenericLidarCoreEmitterSt
 ROOT_PRIM = "Lidar"
 
 
-def write_isaac_usd(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
+def write_isaac_usd(design: DesignSpec, rays: Rays, path: Path, options: WriteOptions) -> list[str]:
     """Write the layer, atomically; returns notes of what the format cannot hold.
 
     Raises:
         ConfigError: Fewer than one frame per second.
     """
-    whole_hz = round(rate_hz)
+    whole_hz = round(options.rate_hz)
     if whole_hz < SLOWEST_ISAAC_HZ:
         raise ConfigError(
-            f"{rate_hz:g} frames per second", where="--rate-hz", allowed=f"at least {SLOWEST_ISAAC_HZ}, a whole number"
+            f"{options.rate_hz:g} frames per second",
+            where="--rate-hz",
+            allowed=f"at least {SLOWEST_ISAAC_HZ}, a whole number",
         )
     mounted = mounts(design, rays)
     lines = [
@@ -270,8 +294,8 @@ def write_isaac_usd(design: DesignSpec, rays: Rays, path: Path, rate_hz: float =
         ]
     write_atomic(path, "\n".join([*lines, "}"]) + "\n")
     notes = [*design_losses(design, mounted), *origin_losses(mounted)]
-    if whole_hz != rate_hz:
-        notes.append(f"frame rates there are whole numbers: {rate_hz:g} Hz is {whole_hz} Hz")
+    if whole_hz != options.rate_hz:
+        notes.append(f"frame rates there are whole numbers: {options.rate_hz:g} Hz is {whole_hz} Hz")
     near = sum(one.gate_m[0] < LEAST_START_M for one in mounted)
     if near:
         notes.append(
@@ -280,6 +304,17 @@ def write_isaac_usd(design: DesignSpec, rays: Rays, path: Path, rate_hz: float =
         )
     notes.append("angles and lengths are kept in single precision, firing times in whole nanoseconds")
     return [*notes, *renamed_note([one.sensor.name for one in mounted], [one.name for one in mounted])]
+
+
+ISAAC_USD = Format(
+    "isaac-usd",
+    ".usda",
+    "an OmniLidar per sensor, gates per ray",
+    write_isaac_usd,
+    reader="Isaac Sim from 5 on",
+    checked="opened with OpenUSD; types, tokens and lengths as its schema has them",
+    holds=frozenset({RAYS, RATE}),
+)
 
 
 def quoted(text: str) -> str:

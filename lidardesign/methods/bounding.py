@@ -10,14 +10,14 @@ from functools import cache, partial
 import numpy as np
 
 from lidardesign.methods.fields import SphereField, central_field, central_interval, even_placement
-from lidardesign.methods.laid_out import LaidOut, Layout, Site, opened_gate
-from lidardesign.methods.returns import RAY_AXES, ReturnTable, TrainingReturns, dense_rays, returns_of
-from lidardesign.problem.problem import Problem
+from lidardesign.methods.laid_out import LaidOut, Layout, Site
+from lidardesign.methods.returns import RAY_AXES, ReturnTable, TrainingReturns, dense_rays, opened_gate, returns_of
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction, observed_point
 
 # An origin axis within 45 degrees of parallel rays only moves them along themselves.
 ALIGNED = math.cos(math.pi / 4)
 TAIL = 0.005  # of the returns are left out at either end of a gate
+
 
 def bounding_layouts(views: TrainingReturns, *, gates_per_ray: bool = False) -> list[Layout]:
     """The layouts: what an engineer would build in five minutes from the training returns.

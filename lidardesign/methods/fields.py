@@ -9,9 +9,7 @@ but the one opposite to its middle. A field of more than a hemisphere is a zone,
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache, partial
 
 import numpy as np
 
@@ -19,7 +17,7 @@ from lidardesign.numerics import TINY, unit_vectors
 from lidardesign.sensors.bandwidth import split_budget
 from lidardesign.sensors.pattern import grid_rows, grid_tangent, low_discrepancy
 from lidardesign.sensors.sensor import boresight_frame
-from lidardesign.space import AZIMUTH, ELEVATION, FULL_TURN, RANGE, DesignSpace, angles, direction, observed_point
+from lidardesign.space import AZIMUTH, ELEVATION, FULL_TURN, DesignSpace, angles, direction
 
 # The projection's radius of the direction opposite to its middle.
 OPPOSITE = 2.0
@@ -261,5 +259,3 @@ def even_placement(low: np.ndarray, high: np.ndarray, count: int, field: SphereF
         extents = np.ones(2)
     points[:, free] += quasi_random_points(count, extents) * (high - low)[free]
     return np.clip(points, low, high)
-
-

@@ -77,7 +77,7 @@ class Layout:
         return tuple(known[space, count] for space in spaces)
 
     def within(self, problem: Problem) -> Positions | None:
-        """As many rays as a problem asks for, or as fit in its bandwidth; None where those are more than `MOST_RAYS`."""
+        """As many rays as a problem asks for, or as fit in its bandwidth; None beyond `MOST_RAYS`."""
         spaces, count = problem.world.spaces, problem.rays
         if count is None:
             count = most_within(

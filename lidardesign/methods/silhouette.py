@@ -24,11 +24,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from lidardesign.numerics import TINY, unit_vectors
 from lidardesign.methods.bounding import box_crop
 from lidardesign.methods.fields import SIXTH, SphereField, even_placement, widened_angles
 from lidardesign.methods.laid_out import LaidOut, Layout, Site
 from lidardesign.methods.returns import RAY_AXES, ReturnTable, TrainingReturns, dense_rays, returns_of
+from lidardesign.numerics import TINY, unit_vectors
 from lidardesign.sensors.pattern import low_discrepancy
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, angles, direction
 
@@ -174,9 +174,7 @@ def _fine_points(found: Survey, count: int) -> tuple[np.ndarray, np.ndarray]:
 SILHOUETTE = LaidOut(
     "silhouette",
     "a lattice over all directions in which training scenes return",
-    lambda problem: _layouts(
-        "silhouette", returns_of(problem.world), lattice_rays, tail=0.0, sigmas=SILHOUETTE_SIGMAS
-    ),
+    lambda problem: _layouts("silhouette", returns_of(problem.world), lattice_rays, tail=0.0, sigmas=SILHOUETTE_SIGMAS),
 )
 LLOYD = LaidOut(
     "lloyd",

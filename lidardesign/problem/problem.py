@@ -18,7 +18,6 @@ from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design import DesignSpec, Gates
 from lidardesign.sensors.pattern import Pattern
 
-
 NOTHING_FITS = "not one ray fits"
 
 

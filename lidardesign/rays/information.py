@@ -16,7 +16,7 @@ import numpy as np
 
 from lidardesign.errors import PluginError
 from lidardesign.numerics import SLACK
-from lidardesign.registry import plugin_method
+from lidardesign.plugins import plugin_method
 from lidardesign.scenes.rays import Returns
 from lidardesign.scenes.scene import Scene
 from lidardesign.sensors.adaptive import Features

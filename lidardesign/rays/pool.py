@@ -29,7 +29,6 @@ from lidardesign.rays.information import CHOSEN_SHARE, MOST_SELECTED
 from lidardesign.rays.proposals import CANDIDATES_PER_RAY, draw_order, nearest_samples
 from lidardesign.rays.selection import Selection, inform_enough
 from lidardesign.rays.training_scenes import InformedScene, TrainingScenes
-from lidardesign.registry import distribution_of
 from lidardesign.run.arrays import read_npz
 from lidardesign.run.clock import phase
 from lidardesign.run.files import write_atomic
@@ -40,7 +39,7 @@ from lidardesign.samples import Samples
 from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, direction
-from lidardesign.task import random_generator
+from lidardesign.task import TASKS, random_generator
 
 FILE_NAME = "informed.npz"
 # So many times as many rays as are chosen from at the task's largest number: sensors see a part of them each.
@@ -137,7 +136,7 @@ def _key(selection: Selection, training: TrainingScenes, count: int) -> str:
         "asked": [count, selection.share],
         "seed": training.seed,
         "versions": versions(),
-        "task": [distribution_of(run.task.name), task.__module__, task.__qualname__],
+        "task": [TASKS.distribution_of(run.task.name), task.__module__, task.__qualname__],
         # a version says nothing of sources under development
         "source": [(name, state.st_size, state.st_mtime_ns) for name, state in sources],
     }

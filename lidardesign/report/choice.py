@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from lidardesign.evaluation.results import Evaluation
 from lidardesign.report.figures import AXIS, LAYOUT, Series
 from lidardesign.report.markup import figure, folded, paragraphs, swatch
 from lidardesign.report.tables import four_digits, table
-from lidardesign.evaluation.results import Evaluation
 from lidardesign.sensors.design import DesignSpec
 
 FEWEST_POINTS = 4  # of a rank correlation that says anything

@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from lidardesign.errors import check_choice
+from lidardesign.evaluation.results import Evaluation, Row
 from lidardesign.report.density_views import Marginal, PlaneDensity
 from lidardesign.report.markup import encoded
 from lidardesign.report.scene_figure import frustum_lines
 from lidardesign.scenes.rays import Outcome, Rays
-from lidardesign.evaluation.results import Evaluation, Row
 from lidardesign.sensors.design import DesignSpec
 
 if TYPE_CHECKING:

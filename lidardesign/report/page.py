@@ -17,6 +17,9 @@ import numpy as np
 from lidardesign.config import FILE_NAME, RunConfig
 from lidardesign.constraints.slack import ConstraintSlack
 from lidardesign.estimates import figure_and_interval
+from lidardesign.evaluation.headline import headline_texts
+from lidardesign.evaluation.request import EvaluationRequest
+from lidardesign.evaluation.results import Evaluation, Paired, Row, verdict
 from lidardesign.report.choice import choice_section
 from lidardesign.report.density_views import DensityView, density_view
 from lidardesign.report.figures import (
@@ -54,9 +57,6 @@ from lidardesign.report.view import view_section
 from lidardesign.run.clock import phase
 from lidardesign.run.files import write_atomic
 from lidardesign.run.manifest import read_manifest, versions
-from lidardesign.evaluation.headline import headline_texts
-from lidardesign.evaluation.request import EvaluationRequest
-from lidardesign.evaluation.results import Evaluation, Paired, Row, verdict
 from lidardesign.scoring.sweep import Sweep
 from lidardesign.sensors.design import MOST_GAP, DesignSpec
 from lidardesign.space import observed_point

@@ -14,13 +14,13 @@ import numpy as np
 
 from lidardesign.constraints.check import check_design
 from lidardesign.constraints.slack import SPACE_MARK, ConstraintSlack, constraint_slack
+from lidardesign.evaluation.request import EvaluationRequest, numbers_fired
+from lidardesign.evaluation.results import Evaluation
 from lidardesign.numerics import TINY
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import Outcome, Rays, gate_outcomes
 from lidardesign.scenes.scene import Body, Box, Mesh, Plane, Round, Scene
 from lidardesign.scenes.surface import BOX_CORNERS, BOX_QUADS, grid_faces, round_triangles
-from lidardesign.evaluation.request import EvaluationRequest, numbers_fired
-from lidardesign.evaluation.results import Evaluation
 from lidardesign.scoring.fired import Positions, fired
 from lidardesign.sensors.adaptive import AdaptiveRays
 from lidardesign.sensors.design import DesignSpec

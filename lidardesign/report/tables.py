@@ -9,8 +9,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from lidardesign.constraints.slack import ConstraintSlack
-from lidardesign.report.markup import definitions, folded
-from lidardesign.run.clock import INSIDE, OTHER
 from lidardesign.evaluation.entries import MILLIMETRES, EffectSummary
 from lidardesign.evaluation.results import (
     Audit,
@@ -21,6 +19,8 @@ from lidardesign.evaluation.results import (
     leading_detail,
     verdict,
 )
+from lidardesign.report.markup import definitions, folded
+from lidardesign.run.clock import INSIDE, OTHER
 from lidardesign.sensors.design import DesignSpec
 
 # The words of the report.

@@ -21,6 +21,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Mapping
+from operator import attrgetter
 from typing import Any, BinaryIO, Literal, NoReturn
 
 from lidardesign.errors import text_of
@@ -285,7 +286,7 @@ def serve(function: str, request: Any) -> None:
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     module, _, name = function.partition(":")
-    work = getattr(importlib.import_module(module), name)
+    work = attrgetter(name)(importlib.import_module(module))
     answers.write(BEGUN)
     answers.flush()
     write_line(answers, work(request, answers))

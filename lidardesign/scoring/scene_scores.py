@@ -18,7 +18,7 @@ from functools import cache
 import numpy as np
 
 from lidardesign.errors import PluginError
-from lidardesign.registry import plugin_method
+from lidardesign.plugins import plugin_method
 from lidardesign.run.clock import Progress, phase
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import Rays, Returns

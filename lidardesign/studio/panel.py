@@ -10,7 +10,7 @@ from typing import Any
 import viser
 
 from lidardesign.constraints.document import SensorConstraints
-from lidardesign.formats.registry import EXPORTERS
+from lidardesign.formats import FORMATS
 from lidardesign.studio.choices import EVERY, MOUNT, Choices, SensorPose, constraint_keys, key_label
 
 NONE, ANY = "nothing", "sensors of any shape"
@@ -173,7 +173,7 @@ class ControlPanel:
         self._input(gui.add_button("Save the design and its constraints"), "save")
         self._saved = gui.add_html(_box("4em", ""))
         self.command = gui.add_text("the same from a shell", initial_value="", multiline=True)
-        self.format = self._input(gui.add_dropdown("export as", ["choose a format", *EXPORTERS]), "export")
+        self.format = self._input(gui.add_dropdown("export as", ["choose a format", *FORMATS.names()]), "export")
         self._input(gui.add_button("Mounting page"), "mounts")
 
     def show(self, choices: Choices, handle: str, scope: str, counts: tuple[int, int]) -> None:

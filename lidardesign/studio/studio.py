@@ -15,14 +15,15 @@ from typing import Any
 import numpy as np
 
 from lidardesign.api.design import Design
-from lidardesign.api.run import FIXED_BASELINES, Run
+from lidardesign.api.problems import fixed_methods
+from lidardesign.api.run import Run
 from lidardesign.api.scores import Scores
 from lidardesign.clouds.seen import Measuring, SeenScene
 from lidardesign.constraints.origins import SAME_PLACE_M, place_text
 from lidardesign.errors import BackgroundNote, ConfigError, LidardesignError
 from lidardesign.estimates import Interval, figure_and_interval, mean_interval, paired_difference
 from lidardesign.fitting.options import check_name
-from lidardesign.formats.registry import EXPORTERS
+from lidardesign.formats import FORMATS
 from lidardesign.parts.catalogue import load_library
 from lidardesign.rays.training_scenes import TrainingScenes
 from lidardesign.report.figures import OUTCOME_WORDS
@@ -84,7 +85,7 @@ class Studio:
         design = self.choices.design
         self._stage = Stage(self._server, design.specification, partial(self.wish, "handle"), self._drag)
         names = [*dict.fromkeys([*self.saved, design.name])]
-        self._panel = ControlPanel(self._server, self.choices, names, FIXED_BASELINES, load_library().names, self.wish)
+        self._panel = ControlPanel(self._server, self.choices, names, fixed_methods(), load_library().names, self.wish)
         self._refresh()
 
     @property
@@ -234,7 +235,7 @@ class Studio:
     def _on_beside(self, value: Any) -> None:
         self._stage.remove("/beside")
         self._beside = self.saved.get(value)
-        if value in FIXED_BASELINES:
+        if value in fixed_methods():
             self._answers.ask("beside", partial(self._find_baseline, value, self.choices))
         self._refresh()
 
@@ -332,7 +333,7 @@ class Studio:
 
     def _find_baseline(self, name: str, choices: Choices) -> None:
         self._begin(f"choosing the rays of {name}")
-        found = self.run.baseline(name, rays=choices.design.usual_count(ignore))
+        found = self.run.fit(method=name, rays=choices.design.usual_count(ignore), name=name)
         self._page.ask("found", partial(self._take_beside, found))
 
     def _take_beside(self, design: Design) -> None:
@@ -437,7 +438,7 @@ class Studio:
         self._server.send_file_download(f"{page.parent.name}.html", page.read_bytes())
 
     def _on_export(self, value: Any) -> None:
-        if value in EXPORTERS:
+        if value in FORMATS.names():
             self._exported(value)
 
     def _exported(self, name: str) -> Path:

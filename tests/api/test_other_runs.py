@@ -12,9 +12,9 @@ from support.command_line import make_run
 
 import lidardesign as package
 from lidardesign.errors import ConfigError
+from lidardesign.evaluation.headline import difference_text
 from lidardesign.formats.designs import load_design
 from lidardesign.scenes.rays import Rays
-from lidardesign.evaluation.headline import difference_text
 from lidardesign.sensors.compare import outside_space
 from lidardesign.sensors.pattern import Pattern
 from lidardesign.space import DIMENSIONS, direction

@@ -11,10 +11,10 @@ from support import references
 from support.fits import design_of, fitted
 from support.scoring import MissTask
 
-from lidardesign.samples import Samples
-from lidardesign.scenes.scene import Body, Capsule, Mesh, Scene, Sphere, rigid
 from lidardesign.evaluation.request import EvaluationRequest
 from lidardesign.evaluation.score import evaluate
+from lidardesign.samples import Samples
+from lidardesign.scenes.scene import Body, Capsule, Mesh, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace, aim
 from lidardesign.task import Metric, Score, TaskConfig
 

@@ -15,11 +15,10 @@ from lidardesign.api.config_reference import config_template, config_text, defau
 from lidardesign.config import PRESETS, DensitySettings, LearningSettings, resolve
 from lidardesign.constraints.document import Constraints
 from lidardesign.errors import ConfigError
-from lidardesign.registry import list_tasks, load_task
 from lidardesign.run.yaml import dump_yaml, parse_yaml
-from lidardesign.task import Metric, TaskConfig
+from lidardesign.task import TASKS, Metric, TaskConfig, load_task
 
-TASKS = [item.name for item in list_tasks() if item.error is None and item.distribution.startswith("lidardesign ")]
+TASKS = [item.name for item in TASKS.listings() if item.error is None and item.distribution.startswith("lidardesign ")]
 # They need a folder or a model, so that no configuration follows from the defaults alone.
 WITHOUT_DEFAULTS = {"meshes": "folder", "mujoco": "model"}
 

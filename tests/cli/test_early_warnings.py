@@ -16,10 +16,9 @@ from lidardesign.config import load_run_config
 from lidardesign.density.objective.prepare import resolution_notes
 from lidardesign.errors import ConfigError, DataError, PluginError
 from lidardesign.formats.designs import read_design
-from lidardesign.registry import load_task
 from lidardesign.sensors.compare import outside_notes
 from lidardesign.space import DesignSpace
-from lidardesign.task import notes_of
+from lidardesign.task import load_task, notes_of
 
 SPACE = DesignSpace(low=(1.0, 0, 0, 2.8, -0.4, 0.5), high=(1.0, 0, 0, 3.5, 0.4, 1.5))
 QUICK = [word for key in ("poses=1", "truth_points=100", "density.field_resolution=8", "density.visibility=off")

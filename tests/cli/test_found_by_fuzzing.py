@@ -19,7 +19,7 @@ from lidardesign.density.training.trainer import _step_of
 from lidardesign.errors import ConfigError, DataError, PluginError
 from lidardesign.limits import MOST_FITTED, MOST_RAYS
 from lidardesign.mixture.fit import FitProblem, fit_sensors
-from lidardesign.registry import plugin_guard
+from lidardesign.plugins import plugin_guard
 from lidardesign.run.manifest import record
 from lidardesign.samples import Samples, load_samples
 from lidardesign.scenes.mesh_files import check_mesh

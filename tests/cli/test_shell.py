@@ -189,14 +189,14 @@ def test_the_files_of_the_gate_are_what_the_program_takes(lidardesign, flat):
 def test_json_stands_alone_whatever_a_plugin_starts_prints_and_leaves_behind():
     noisy = """
 import atexit, os
-from lidardesign import registry
-kept = registry.load_task
+from lidardesign import task
+kept = task.load_task
 def load_task(name):
     os.system("echo from a process")
     print("from Python")
     atexit.register(print, "at the end")
     return kept(name)
-registry.load_task = load_task
+task.load_task = load_task
 """
     for name, code in (("flatland", 0), ("no_such_task", 2)):
         process = program("tasks", "show", name, "--json", before=noisy)

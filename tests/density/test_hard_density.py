@@ -39,13 +39,12 @@ from lidardesign.density.objective.visibility import MINIMUM_COSINE, Optics, Ray
 from lidardesign.density.training.losses import Pool, balancing_loss, pathwise_loss
 from lidardesign.errors import ConfigError
 from lidardesign.rays.proposals import Proposals
-from lidardesign.registry import load_task
 from lidardesign.samples import Samples, load_samples
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Scene, Sphere, rigid
 from lidardesign.sensors.pattern import even_rays
 from lidardesign.space import ELEVATION, RANGE, DesignSpace, aim, direction, observed_point
-from lidardesign.task import TaskConfig
+from lidardesign.task import TaskConfig, load_task
 
 WAYS = ("off", "quadrature", "raycast")
 SPACE = DesignSpace((-0.1, -0.1, -0.1, -0.5, -0.5, 0.2), (0.1, 0.1, 0.1, 0.5, 0.5, 4.0))

@@ -20,9 +20,9 @@ from lidardesign.density.fields.distance import TableField, build_field
 from lidardesign.density.objective.surfaces import SceneTable, near_pairs
 from lidardesign.density.objective.target import Target, build_target
 from lidardesign.density.objective.visibility import NoVisibility, Optics
+from lidardesign.evaluation.accuracy.fields import exact_distances
 from lidardesign.scenes.mesh_files import check_mesh, unique_rows
 from lidardesign.scenes.scene import Body, Box, Mesh, Scene, Sphere, rigid
-from lidardesign.evaluation.accuracy.fields import exact_distances
 from lidardesign.space import DesignSpace
 
 BALL = trimesh.creation.icosphere(subdivisions=2, radius=0.5)

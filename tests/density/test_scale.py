@@ -16,9 +16,9 @@ from support.learning import config_of
 from lidardesign.config import DensitySettings, resolve
 from lidardesign.density.objective.prepare import training_scenes
 from lidardesign.density.objective.scale import scale_notes
-from lidardesign.registry import load_task
 from lidardesign.scenes.scene import Body, Box, Capsule, Plane, Scene, Sphere, rigid
 from lidardesign.space import RANGE, DesignSpace
+from lidardesign.task import load_task
 
 # Sensors within 0.1 m of the origin look to +x.
 AHEAD = DesignSpace((-0.1, -0.1, 0, -0.6, -0.6, 0.8), (0.1, 0.1, 0, 0.6, 0.6, 2.2))

@@ -9,12 +9,13 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.exports import write_as
 from support.rigs import rig
 
 from lidardesign.constraints.document import Constraints
 from lidardesign.errors import DataError
+from lidardesign.formats import FORMATS
 from lidardesign.formats.designs import load_design
-from lidardesign.formats.registry import EXPORTERS
 from lidardesign.formats.rig import aim_of, rig_constraints
 from lidardesign.scenes.rays import rotation_of_quaternion, rotation_of_rpy
 from lidardesign.sensors.design import DesignSpec
@@ -41,8 +42,8 @@ def assert_same_rays(found, expected, tolerance=EXACT):
 def test_an_exported_rig_comes_back_ray_by_ray(tmp_path, name):
     design, _ = rig()
     expected = design.rays()
-    path = tmp_path / f"rig{EXPORTERS[name].suffix}"
-    EXPORTERS[name].write(design, expected, path)
+    path = tmp_path / f"rig{FORMATS.load(name).suffix}"
+    write_as(name, design, expected, path)
     found = load_design(path)
     if name == "mjcf":  # lists sensors in the order in which they first fire
         order = {one: index for index, one in enumerate(dict.fromkeys(expected.sensor.tolist()))}

@@ -11,7 +11,6 @@ import pytest
 from support.command_line import make_run
 
 from lidardesign.errors import ConfigError
-from lidardesign.scenes.rays import Rays
 from lidardesign.evaluation.request import (
     counts_without_baselines,
     fired_numbers,
@@ -19,6 +18,7 @@ from lidardesign.evaluation.request import (
     numbers_fired,
     usual_numbers,
 )
+from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import save_design
 from lidardesign.sensors.pattern import Pattern

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from lidardesign.scoring.baselines.simple import OccupancyGrid
 from scipy.stats import chi2
 from support.baselines import SceneBaselines
 from support.chi_square import UNLIKELY, counts_of_cells, mass_of_cells, p_value
@@ -29,7 +30,6 @@ from lidardesign.mixture.components import log_density
 from lidardesign.mixture.support import pin_samples, restrict_samples
 from lidardesign.numerics import systematic_draw
 from lidardesign.samples import Samples
-from lidardesign.scoring.baselines.simple import OccupancyGrid
 from lidardesign.sensors.pattern import even_rays, low_discrepancy
 from lidardesign.sensors.sensor import tangent_coordinates
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, angles, direction

@@ -9,16 +9,15 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from lidardesign import registry
 from lidardesign.config import resolve
 from lidardesign.constraints.document import Constraints
+from lidardesign.contract import contract_of_format
 from lidardesign.errors import LidardesignError
-from lidardesign.registry import load_task
 from lidardesign.run.yaml import parse_yaml
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Scene
 from lidardesign.simulate.returns import simulate
-from lidardesign.task import Task, conditions_of
+from lidardesign.task import Task, check_interface, conditions_of, load_task
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -26,6 +25,7 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 CONSTRAINTS = (DOCS / "constraints.md").read_text(encoding="utf-8")
 SHELL = (DOCS / "shell.md").read_text(encoding="utf-8")
 FIRST_TASK = (DOCS / "first-task.md").read_text(encoding="utf-8")
+WRITING_METHODS = (DOCS / "writing-methods.md").read_text(encoding="utf-8")
 WRITING_TASKS = (DOCS / "writing-tasks.md").read_text(encoding="utf-8")
 # The README's pictures are downloaded by everyone who clones it.
 LARGEST_PICTURE_BYTES = 250_000
@@ -121,7 +121,7 @@ def test_the_example_task_keeps_the_contract_and_scores_a_ray():
     namespace: dict[str, object] = {}
     exec(blocks("python", FIRST_TASK)[0], namespace)  # the page's own text
     task = namespace["RoverTask"]()
-    registry.check_interface("rover", task)
+    check_interface("rover", task)
     assert isinstance(task, Task)
     config = task.Config()
     scene = task.scenes(config, "test", 0)[0]
@@ -140,7 +140,7 @@ def moving_scene_of(name: str, block: int):
     namespace: dict[str, object] = {}
     exec(blocks("python", WRITING_TASKS)[block], namespace)  # the page's own text
     task = namespace[name]()
-    registry.check_interface(task.name, task)
+    check_interface(task.name, task)
     config = task.Config()
     first, again = (task.scenes(config, "test", 0)[0] for _ in range(2))
     for one, other in zip(first.bodies, again.bodies, strict=True):
@@ -183,6 +183,14 @@ def test_the_drive_of_the_guide_is_scored_over_its_positions():
     assert task.score(scene, returns).value == 0.0
     away = Rays(rays[0].origin_m, -rays[0].direction, rays[0].gate_m, rays[0].sensor, rays[0].time_s)
     assert task.score(scene, [*simulate(scene, away), *returns[1:]]).value == 25.0
+
+
+def test_the_format_of_the_guide_is_short_and_keeps_every_law():
+    code = blocks("python", WRITING_METHODS)[0]
+    assert len(code.splitlines()) <= 35
+    namespace: dict[str, object] = {}
+    exec(code, namespace)  # the page's own text
+    assert {one.outcome for one in contract_of_format(namespace["POINTS"]).findings()} == {"pass"}
 
 
 @pytest.mark.parametrize("page", [ROOT / "README.md", *sorted(DOCS.glob("*.md"))], ids=lambda p: p.name)

@@ -12,11 +12,11 @@ from support.planning import SINGLE
 from support.scoring import MissTask, design, make_request, scenes
 
 from lidardesign.api.run import open_run
-from lidardesign.report.tables import audit_section, effects_section
-from lidardesign.scenes.scene import Ambient, Scene
 from lidardesign.evaluation.entries import effect_notes, effect_summaries
 from lidardesign.evaluation.results import Audit, AuditRow
 from lidardesign.evaluation.score import evaluate
+from lidardesign.report.tables import audit_section, effects_section
+from lidardesign.scenes.scene import Ambient, Scene
 from lidardesign.simulate import plan as plan_module
 from lidardesign.simulate.detector.physics import EFFECTS, IDEAL, Detector
 from lidardesign.simulate.plan import Planner, Tolerance, parse_effects

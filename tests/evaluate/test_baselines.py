@@ -4,12 +4,12 @@ import math
 
 import numpy as np
 import pytest
+from lidardesign.scoring.baselines.simple import check_baseline
+from lidardesign.scoring.baselines.views import unrolled
 from support.baselines import SceneBaselines, balls
 
 from lidardesign.errors import ConfigError
 from lidardesign.scenes.scene import Body, Box, Scene, rigid
-from lidardesign.scoring.baselines.simple import check_baseline
-from lidardesign.scoring.baselines.views import unrolled
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.simulate.returns import simulate
 from lidardesign.space import DesignSpace, angles

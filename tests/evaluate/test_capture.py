@@ -12,7 +12,6 @@ from support.rays import rays_along
 from support.sensors import normal_sensor
 
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.formats.galvo import degree_frame, scan_directions, write_galvo
 from lidardesign.evaluation.captures.capture import Capture, load_capture
 from lidardesign.evaluation.captures.scan import (
     Captured,
@@ -25,6 +24,7 @@ from lidardesign.evaluation.captures.scan import (
     whole_window,
 )
 from lidardesign.evaluation.captures.score import CaptureSettings, evaluate_capture
+from lidardesign.formats.galvo import degree_frame, scan_directions, write_galvo
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import save_design
 from lidardesign.simulate.detector import physics

@@ -11,9 +11,9 @@ from scipy.io import savemat
 from support.captures import BINS, make_capture
 
 from lidardesign.errors import DataError
-from lidardesign.run.inputs import CAPTURE
 from lidardesign.evaluation.captures import capture as matlab
 from lidardesign.evaluation.captures.capture import load_capture, read_arrays
+from lidardesign.run.inputs import CAPTURE
 
 
 def save_npz(path, arrays):

@@ -17,8 +17,8 @@ from support.workers import make_request, results
 
 from lidardesign import workers
 from lidardesign.errors import ConfigError
-from lidardesign.registry import load_task
 from lidardesign.evaluation.score import evaluate
+from lidardesign.task import load_task
 from lidardesign.workers import opened_workers
 
 with warnings.catch_warnings():

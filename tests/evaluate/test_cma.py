@@ -10,6 +10,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from lidardesign.scoring.baselines import cma
+from lidardesign.scoring.baselines.candidates import rays_at
+from lidardesign.scoring.baselines.cma import CmaCandidate, CmaSettings, MovableSensors
 from support.baselines import balls
 from support.scoring import HitTask, MissTask, make_request
 from support.sensors import normal_sensor
@@ -17,13 +20,10 @@ from support.sensors import normal_sensor
 from lidardesign.api.scores import score_choices
 from lidardesign.cli.commands.evaluate import search_display
 from lidardesign.errors import ConfigError
-from lidardesign.numerics import wrap_angle
-from lidardesign.parts.catalogue import Pose, find_part, part_design
-from lidardesign.scoring.baselines import cma
-from lidardesign.scoring.baselines.candidates import rays_at
-from lidardesign.scoring.baselines.cma import CmaCandidate, CmaSettings, MovableSensors
 from lidardesign.evaluation.entries import entries_of
 from lidardesign.evaluation.score import evaluate
+from lidardesign.numerics import wrap_angle
+from lidardesign.parts.catalogue import Pose, find_part, part_design
 from lidardesign.scoring.scene_scores import TrainingScorer
 from lidardesign.sensors.adaptive import mean_mbps
 from lidardesign.sensors.bandwidth import Bandwidth

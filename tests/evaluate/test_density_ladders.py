@@ -22,11 +22,11 @@ from lidardesign.density.training.learned import LearningSteps, gradient, in_ari
 from lidardesign.density.training.losses import Pool
 from lidardesign.density.training.quality import misplaced_share
 from lidardesign.errors import NumericalError
-from lidardesign.scenes.scene import Body, Box, Mesh, Receiver, Scene, Sphere, rigid
 from lidardesign.evaluation.accuracy import fields
 from lidardesign.evaluation.accuracy import training as learning_steps
 from lidardesign.evaluation.accuracy.fields import LOG_OPAQUE, exact_distances, fresh_table, opaque_target
 from lidardesign.evaluation.accuracy.probes import draw_probes, few_columns, with_frames
+from lidardesign.scenes.scene import Body, Box, Mesh, Receiver, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace
 
 SPACE = DesignSpace((0, 0, 0, -0.35, -0.35, 0.5), (0, 0, 0, 0.35, 0.35, 3.5))

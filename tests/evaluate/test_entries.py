@@ -11,9 +11,9 @@ from support.scoring import MissTask, make_request
 from support.sensors import normal_sensor
 
 from lidardesign.errors import ConfigError
-from lidardesign.scenes.scene import Body, Box, Capsule, Scene, Sphere, rigid
 from lidardesign.evaluation.entries import entries_of
 from lidardesign.evaluation.score import evaluate
+from lidardesign.scenes.scene import Body, Box, Capsule, Scene, Sphere, rigid
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.pattern import Pattern

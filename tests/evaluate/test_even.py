@@ -4,14 +4,14 @@ import math
 
 import numpy as np
 import pytest
+from lidardesign.scoring.baselines.candidates import LayoutSite
+from lidardesign.scoring.baselines.even import Patch, Zone, bounding, central_field, even_placement
+from lidardesign.scoring.baselines.views import TrainingViews
 from scipy.spatial import ConvexHull, SphericalVoronoi, cKDTree
 from scipy.spatial.transform import Rotation
 from support.baselines import SceneBaselines, balls
 
 from lidardesign.scenes.scene import Body, Box, Scene, rigid
-from lidardesign.scoring.baselines.candidates import LayoutSite
-from lidardesign.scoring.baselines.even import Patch, Zone, bounding, central_field, even_placement
-from lidardesign.scoring.baselines.views import TrainingViews
 from lidardesign.space import DesignSpace, angles, direction
 
 SPHERE = DesignSpace((0, 0, 0, 0, -math.pi / 2, 0.05), (0, 0, 0, 2 * math.pi, math.pi / 2, 4.0))

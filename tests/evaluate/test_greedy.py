@@ -7,18 +7,18 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
-from support.baselines import SceneBaselines, balls
-from support.scoring import MissTask, design, make_request, rows_by_key
-
-from lidardesign.rays import information
-from lidardesign.rays.training_scenes import TrainingScenes
 from lidardesign.scoring.baselines import greedy as greedy_module
 from lidardesign.scoring.baselines.candidates import whole_range
 from lidardesign.scoring.baselines.greedy import Fired, GreedyCandidate, greedy_rays
 from lidardesign.scoring.baselines.views import TrainingViews
+from scipy.spatial import cKDTree
+from support.baselines import SceneBaselines, balls
+from support.scoring import MissTask, design, make_request, rows_by_key
+
 from lidardesign.evaluation.entries import entries_of
 from lidardesign.evaluation.score import evaluate
+from lidardesign.rays import information
+from lidardesign.rays.training_scenes import TrainingScenes
 from lidardesign.sensors.adaptive import mean_mbps
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.pattern import Pattern

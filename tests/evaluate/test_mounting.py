@@ -15,10 +15,10 @@ from support.workers import random_rays
 from lidardesign.api.run import open_run
 from lidardesign.errors import ConfigError
 from lidardesign.estimates import paired_difference
-from lidardesign.report.tables import mounting_table
 from lidardesign.evaluation.mounting import MountError
 from lidardesign.evaluation.score import evaluate
 from lidardesign.evaluation.seeds import over_seeds
+from lidardesign.report.tables import mounting_table
 
 DEGREE = math.pi / 180
 ERROR = MountError(0.005, 0.5 * DEGREE)

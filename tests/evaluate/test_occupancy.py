@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
-from lidardesign.scenes.scene import Body, Box, Scene, Sphere, rigid
 from lidardesign.scoring.baselines.candidates import LayoutSite
 from lidardesign.scoring.baselines.simple import AimedPoints, occupancy, occupancy_grid
 from lidardesign.scoring.baselines.views import RAY_AXES
+
+from lidardesign.scenes.scene import Body, Box, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace, direction, observed_point
 
 CEILING = DesignSpace((-1, -1, 1, 0, -math.pi / 2, 0.1), (1, 1, 1, 2 * math.pi, -0.2, 2.5))

@@ -21,6 +21,8 @@ from support.report_pages import (
     ray_segments,
 )
 
+from lidardesign.evaluation.entries import StrongestBaseline
+from lidardesign.evaluation.results import Evaluation, leading_detail, verdict
 from lidardesign.report.figures import curve_figure, far_baselines, marginal_figure, plane_figure, series
 from lidardesign.report.markup import asset
 from lidardesign.report.page import report_html
@@ -42,8 +44,6 @@ from lidardesign.report.scene_figure import (
 from lidardesign.report.tables import CommandTimes, constraints_table, rows_table, times_tables
 from lidardesign.report.view import MOST_BODIES, MOST_SENSORS, drawn_bodies, view_bounds, view_document, view_notes
 from lidardesign.scenes.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Scene, Sphere, rigid
-from lidardesign.evaluation.entries import StrongestBaseline
-from lidardesign.evaluation.results import Evaluation, leading_detail, verdict
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.task import Metric
 

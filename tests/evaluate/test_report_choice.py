@@ -10,9 +10,9 @@ import plotly.graph_objects as go
 import pytest
 from support.report_pages import NASTY, make_row, make_sensor
 
+from lidardesign.evaluation.results import Evaluation
 from lidardesign.report.choice import choice_section, correlation_sentence
 from lidardesign.report.figures import series
-from lidardesign.evaluation.results import Evaluation
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.task import Metric
 

@@ -6,9 +6,9 @@ from dataclasses import replace
 import pytest
 from support.report_pages import NASTY, make_evaluation, make_row, make_sensor
 
-from lidardesign.report.page import result_section
 from lidardesign.evaluation.entries import StrongestBaseline
 from lidardesign.evaluation.results import Evaluation, Paired
+from lidardesign.report.page import result_section
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.task import Metric
 

@@ -5,20 +5,20 @@ from io import StringIO
 
 import numpy as np
 import pytest
+from lidardesign.scoring.baselines import candidates
 from rich.console import Console
 from support.scoring import RAYS, HitTask, MissTask, design, make_request, rows_by_key, scenes
 
 from lidardesign.cli.terminal.score_tables import show_evaluation
 from lidardesign.errors import ConfigError, DataError, PluginError
 from lidardesign.estimates import mean_interval, paired_difference
+from lidardesign.evaluation.entries import FEWEST_BASELINE_SCENES
+from lidardesign.evaluation.results import csv_text, verdict
+from lidardesign.evaluation.score import evaluate
 from lidardesign.report.figures import scores_figure
 from lidardesign.report.tables import paired_tables
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import rigid
-from lidardesign.scoring.baselines import candidates
-from lidardesign.evaluation.entries import FEWEST_BASELINE_SCENES
-from lidardesign.evaluation.results import csv_text, verdict
-from lidardesign.evaluation.score import evaluate
 from lidardesign.scoring.scene_scores import silent_notes
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.space import DesignSpace

@@ -8,9 +8,9 @@ import pytest
 from support.evaluations import make_evaluation
 from support.sensors import normal_sensor
 
+from lidardesign.evaluation.results import csv_text, write_csv
 from lidardesign.report.figures import COLOURS, curve_figure, log_ticks, logarithmic, series
 from lidardesign.report.scene_figure import constraint_slack_of
-from lidardesign.evaluation.results import csv_text, write_csv
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.space import DesignSpace
 

@@ -4,14 +4,14 @@ import math
 
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
-from support.baselines import SceneBaselines, balls
-
-from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scoring.baselines.candidates import LayoutSite
 from lidardesign.scoring.baselines.even import bounding
 from lidardesign.scoring.baselines.silhouette import lloyd, silhouette, survey
 from lidardesign.scoring.baselines.views import TrainingViews
+from scipy.spatial import cKDTree
+from support.baselines import SceneBaselines, balls
+
+from lidardesign.scenes.casting import SceneCaster
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.space import DesignSpace, direction
 

@@ -9,7 +9,6 @@ import pytest
 from support.evaluations import make_row
 from support.scoring import HitTask, MissTask, design, make_request, scenes
 
-from lidardesign.scenes.casting import SceneCaster
 from lidardesign.evaluation.entries import (
     FEWEST_BASELINE_SCENES,
     LARGEST_BASELINE_SHARE,
@@ -20,6 +19,7 @@ from lidardesign.evaluation.entries import (
 from lidardesign.evaluation.results import middle_rays
 from lidardesign.evaluation.score import evaluate
 from lidardesign.evaluation.seeds import over_seeds
+from lidardesign.scenes.casting import SceneCaster
 
 HELD_BACK = scenes(31, 40, side=0.3)
 

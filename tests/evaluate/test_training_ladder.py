@@ -19,14 +19,13 @@ from lidardesign.density.training import trainer as steps
 from lidardesign.density.training.learned import load_flow, remeasured, seconds_at
 from lidardesign.density.training.trainer import Trainer
 from lidardesign.errors import DataError, NumericalError
-from lidardesign.registry import load_task
-from lidardesign.run.manifest import start_manifest
 from lidardesign.evaluation.accuracy import evaluation as accuracy
 from lidardesign.evaluation.accuracy import fields, training
 from lidardesign.evaluation.accuracy.probes import AccuracyRequest
 from lidardesign.evaluation.request import EvaluationRequest
+from lidardesign.run.manifest import start_manifest
 from lidardesign.scoring.sweep import Accuracy
-from lidardesign.task import random_generator, scenes_of
+from lidardesign.task import load_task, random_generator, scenes_of
 
 SMALL = (
     "learning.batch=128", "learning.layers=1", "learning.hidden=16", "learning.bins=8", "learning.samples=2000",

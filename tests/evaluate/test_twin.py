@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
+from lidardesign.scoring.baselines.greedy import Fired
+from lidardesign.scoring.baselines.simple import TwinCandidate
 from support.command_line import make_run
 from support.conditioned_runs import make_conditioned_run
 from support.sensors import normal_sensor
@@ -17,8 +19,6 @@ from lidardesign.fitting import fit as fit_module
 from lidardesign.fitting.fit import fit_design, twin_samples, twin_without_visibility
 from lidardesign.fitting.request import FitRequest, RunTarget
 from lidardesign.run_folder import RunFolder
-from lidardesign.scoring.baselines.greedy import Fired
-from lidardesign.scoring.baselines.simple import TwinCandidate
 from lidardesign.sensors.adaptive import mean_mbps
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design import DesignSpec

@@ -20,8 +20,8 @@ from support.workers import make_request, results
 
 from lidardesign.api.run import open_run
 from lidardesign.errors import ConfigError, NumericalError, PluginError
-from lidardesign.registry import load_task
 from lidardesign.evaluation.score import evaluate
+from lidardesign.task import load_task
 from lidardesign.workers import opened_workers
 
 

@@ -8,12 +8,12 @@ import xml.etree.ElementTree as ElementTree
 
 import numpy as np
 import pytest
+from support.exports import write_as
 from support.rays import rays_along
 from support.rigs import even, farthest_nearest, sensor
 from support.sensors import normal_sensor
 
 from lidardesign.errors import ConfigError
-from lidardesign.formats.registry import EXPORTERS
 from lidardesign.sensors.design import DesignSpec
 
 ONE = DesignSpec("one", (normal_sensor("one"),))
@@ -77,7 +77,7 @@ def helios_range_m(scanner, channel, range_m, version, brightness):
 
 
 def helios_scanner(folder, gates_m):
-    notes = EXPORTERS["helios"].write(ONE, rays_along(np.tile(FORWARD, (len(gates_m), 1)), gates_m), folder)
+    notes = write_as("helios", ONE, rays_along(np.tile(FORWARD, (len(gates_m), 1)), gates_m), folder)
     scanner = ElementTree.parse(folder / "scanners.xml").find("scanner")
     return scanner, list(scanner.iter("channel")), notes
 
@@ -161,7 +161,7 @@ def test_every_frame_of_carla_has_the_grids_rays_once(tmp_path, rate_hz, case):
     count = len(local)
     looking = sensor("one", (0.3, -0.4, 1.2), 2.5, -0.4, 0.3)
     rays = rays_along(local @ looking.frame, (0.0, 9.0), looking.origin_m)
-    EXPORTERS["carla"].write(DesignSpec("one", (looking,)), rays, tmp_path / "out.json", rate_hz)
+    write_as("carla", DesignSpec("one", (looking,)), rays, tmp_path / "out.json", rate_hz)
     whole = json.loads((tmp_path / "out.json").read_text())
     [written] = whole["sensors"]
     assert (written["name"], written["type"]) == ("one", "sensor.lidar.ray_cast")
@@ -191,7 +191,7 @@ def test_carla_sweeps_just_the_whole_field_in_a_frame(tmp_path, rate_hz, field_d
     field = np.radians(field_deg)
     local = even(4, 1, (-field / 2, field / 4), (0.0, 0.0))
     rays = rays_along(local, (0.0, 9.0))
-    EXPORTERS["carla"].write(ONE, rays, tmp_path / "out.json", rate_hz)
+    write_as("carla", ONE, rays, tmp_path / "out.json", rate_hz)
     whole = json.loads((tmp_path / "out.json").read_text())
     text = whole["sensors"][0]["attributes"]
     step_s = SINGLE(whole["fixed_delta_seconds"])
@@ -203,7 +203,7 @@ def test_carla_sweeps_just_the_whole_field_in_a_frame(tmp_path, rate_hz, field_d
 @pytest.mark.parametrize("rate_hz", [0.001, 1.0, 2.49, 2001, 1e5])
 def test_carla_refuses_frames_that_unreal_does_not_have(tmp_path, rate_hz):
     with pytest.raises(ConfigError, match=r"--rate-hz[\s\S]*2\.5 to 2000"):
-        EXPORTERS["carla"].write(ONE, rays_along(FORWARD, np.array([[0.0, 9.0]])), tmp_path / "out.json", rate_hz)
+        write_as("carla", ONE, rays_along(FORWARD, np.array([[0.0, 9.0]])), tmp_path / "out.json", rate_hz)
 
 
 # Gazebo -------------------------------------------------------------------------------------------------------------
@@ -260,7 +260,7 @@ GAZEBO_GRIDS = {
 def test_gazebos_pixels_are_no_farther_from_the_rays_than_the_note_says(tmp_path, case):
     (columns, rows), azimuth, elevation, side = GAZEBO_GRIDS[case]
     local = even(columns, rows, azimuth, elevation)
-    notes = EXPORTERS["sdf"].write(ONE, rays_along(local, (0.0, 9.0)), tmp_path / "out.sdf")
+    notes = write_as("sdf", ONE, rays_along(local, (0.0, 9.0)), tmp_path / "out.sdf")
     [sensor] = ElementTree.parse(tmp_path / "out.sdf").iter("sensor")
     read, found_side = gazebo_pixels(sensor.find("lidar/scan"))
     assert found_side == side
@@ -280,7 +280,7 @@ def test_gazebos_pixels_are_no_farther_from_the_rays_than_the_note_says(tmp_path
 @pytest.mark.parametrize("rate_hz", [0.001, 29.97, 1e6])
 def test_rgl_takes_patterns_ranges_and_rates_at_their_ends(tmp_path, rate_hz):
     gates_m = np.array([[0, 0], [0, 1e-9], [0.3, 0.3 + 1e-12], [1e-30, 1e9]])
-    EXPORTERS["rgl"].write(ONE, rays_along(np.tile(FORWARD, (len(gates_m), 1)), gates_m), tmp_path / "out", rate_hz)
+    write_as("rgl", ONE, rays_along(np.tile(FORWARD, (len(gates_m), 1)), gates_m), tmp_path / "out", rate_hz)
     plugin = ElementTree.parse(tmp_path / "out" / "model.sdf").find("model/link/sensor/plugin")
     assert {"update_rate", "range", "topic", "frame", "pattern_preset_path"} <= {one.tag for one in plugin}
     whole = np.array([[SINGLE(plugin.findtext(f"range/{name}")) for name in ("min", "max")]])
@@ -320,7 +320,7 @@ def cloudcompare(element, names):
 
 def test_cloudcompare_knows_every_property_of_the_points(tmp_path):
     trimesh = pytest.importorskip("trimesh")
-    EXPORTERS["ply"].write(ONE, rays_along(FORWARD, (0.0, 9.0)), tmp_path)
+    write_as("ply", ONE, rays_along(FORWARD, (0.0, 9.0)), tmp_path)
     points, beams = (trimesh.load(tmp_path / f"{name}.ply").metadata["_ply_raw"] for name in ("rays", "beams"))
     names = list(points["vertex"]["properties"])
     known = cloudcompare("vertex", names)

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from support.exports import write_as
 from support.rigs import rig
 
 from lidardesign.errors import ConfigError
-from lidardesign.formats.registry import EXPORTERS
 from lidardesign.scenes.rays import rotation_of_quaternion
 from lidardesign.space import direction
 
@@ -37,7 +37,7 @@ TOKENS = {
 def stage(tmp_path_factory):
     usd = pytest.importorskip("pxr.Usd", reason="needs usd-core: the extra `consumers`")
     path = tmp_path_factory.mktemp("usd") / "rig.usda"
-    EXPORTERS["isaac-usd"].write(DESIGN, RAYS, path)
+    write_as("isaac-usd", DESIGN, RAYS, path)
     return usd.Stage.Open(str(path))
 
 
@@ -89,7 +89,7 @@ def test_usd_places_every_ray_with_its_gate(stage):
 
 def test_frames_are_whole_numbers_per_second(tmp_path):
     with pytest.raises(ConfigError, match=r"0\.3 frames per second"):
-        EXPORTERS["isaac-usd"].write(DESIGN, RAYS, tmp_path / "slow", 0.3)
+        write_as("isaac-usd", DESIGN, RAYS, tmp_path / "slow", 0.3)
     assert list(tmp_path.iterdir()) == []
-    notes = EXPORTERS["isaac-usd"].write(DESIGN, RAYS, tmp_path / "out", 12.6)
+    notes = write_as("isaac-usd", DESIGN, RAYS, tmp_path / "out", 12.6)
     assert any("12.6 Hz is 13 Hz" in note for note in notes)

@@ -12,15 +12,16 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.exports import write_as
 from support.rays import rays_along
 from support.rigs import NASTY, even, farthest_nearest, read_sdf, rig, sdf_reader, spinning
 
 from lidardesign.api.export import DesignSource, ExportRequest
 from lidardesign.errors import ConfigError, DataError
+from lidardesign.formats import FORMATS
 from lidardesign.formats.designs import load_design
 from lidardesign.formats.mounts import mounts
 from lidardesign.formats.names import identifier
-from lidardesign.formats.registry import EXPORTERS
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.mujoco_models import RobotFile, bodies_from_mujoco, load_model
 from lidardesign.scenes.scene import Body, Box, Mesh, Scene, Sphere, rigid
@@ -40,8 +41,8 @@ def exported(tmp_path_factory):
     folder = tmp_path_factory.mktemp("robots")
     found = {}
     for name in ROBOTS:
-        path = folder / f"rig{EXPORTERS[name].suffix}"
-        found[name] = (path, EXPORTERS[name].write(DESIGN, RAYS, path))
+        path = folder / f"rig{FORMATS.load(name).suffix}"
+        found[name] = (path, write_as(name, DESIGN, RAYS, path))
     return found
 
 
@@ -156,7 +157,7 @@ def test_sensors_on_a_robot_measure_our_distances_wherever_it_is(tmp_path, robot
     (tmp_path / "exports").mkdir()
     path = tmp_path / "exports" / "with.xml"
     design = replace(DESIGN, mount=mount)
-    EXPORTERS["mjcf"].write(design, RAYS, path, robot=RobotFile(robot))
+    write_as("mjcf", design, RAYS, path, robot=RobotFile(robot))
     alone, _ = load_model(robot)
     model = mujoco.MjModel.from_xml_path(str(path))
     assert (model.nq, model.nu) == (alone.nq, alone.nu)
@@ -202,7 +203,7 @@ def test_rangefinders_fire_at_the_frame_rate_and_keep_what_they_read(tmp_path, r
     import mujoco
 
     path = tmp_path / "with.xml"
-    EXPORTERS["mjcf"].write(replace(DESIGN, mount="torso"), RAYS, path, rate_hz, RobotFile(own_robot(tmp_path)))
+    write_as("mjcf", replace(DESIGN, mount="torso"), RAYS, path, rate_hz, RobotFile(own_robot(tmp_path)))
     model = mujoco.MjModel.from_xml_path(str(path))
     every = mujoco.MjModel.from_xml_path(str(path))
     every.sensor_interval[:] = 0
@@ -227,7 +228,7 @@ def test_rangefinders_fire_at_the_frame_rate_and_keep_what_they_read(tmp_path, r
 def test_sensors_on_a_robot_are_read_back(tmp_path):
     path, robot = tmp_path / "with.xml", own_robot(tmp_path)
     robot.write_text(ROBOT.replace('name="torso" pos="0 0 1"', 'name="torso"'))
-    EXPORTERS["mjcf"].write(replace(DESIGN, mount="torso"), RAYS, path, robot=RobotFile(robot))
+    write_as("mjcf", replace(DESIGN, mount="torso"), RAYS, path, robot=RobotFile(robot))
     again = load_design(path, reach_m=9.0)
     assert len(again.sensors) == len(DESIGN.sensors) + 1  # and the robot's own rangefinder
     rays = again.rays(len(RAYS) + 1)
@@ -239,27 +240,27 @@ def test_a_mounted_design_goes_into_the_model_of_its_run(tmp_path):
     config = SimpleNamespace(task=SimpleNamespace(model=own_robot(tmp_path), folder=tmp_path))
     fixed = replace(DESIGN, mount="torso")
     source = DesignSource(fixed, SimpleNamespace(config=config, folder=tmp_path))
-    exported = ExportRequest(source, EXPORTERS["mjcf"], tmp_path / "with.xml").write()
+    exported = ExportRequest(source, FORMATS.load("mjcf"), tmp_path / "with.xml").write()
     assert exported.rays == len(RAYS)
     model, data = simulated(exported.path)
     assert {model.body(int(body)).name for body in model.site_bodyid} == {"torso"}
     assert len(data.sensordata) == len(RAYS) + 1
-    again = ExportRequest(source, EXPORTERS["mjcf"], tmp_path / "both.xml", robot=exported.path).write()
+    again = ExportRequest(source, FORMATS.load("mjcf"), tmp_path / "both.xml", robot=exported.path).write()
     model, data = simulated(again.path)
     assert len(data.sensordata) == 2 * len(RAYS) + 1
     with pytest.raises(ConfigError, match=r"robot\.xml is the robot's model"):
-        ExportRequest(source, EXPORTERS["mjcf"], tmp_path / "robot.xml").write()
+        ExportRequest(source, FORMATS.load("mjcf"), tmp_path / "robot.xml").write()
     assert (tmp_path / "robot.xml").read_text() == ROBOT
 
 
 def test_a_robot_without_the_body_that_carries_the_sensors_is_refused(tmp_path):
     with pytest.raises(DataError, match=r"no body 'torsos'[\s\S]*torso"):
-        EXPORTERS["mjcf"].write(
-            replace(DESIGN, mount="torsos"), RAYS, tmp_path / "a.xml", robot=RobotFile(own_robot(tmp_path))
+        write_as(
+            "mjcf", replace(DESIGN, mount="torsos"), RAYS, tmp_path / "a.xml", robot=RobotFile(own_robot(tmp_path))
         )
     with pytest.raises(ConfigError, match="cannot hold a robot"):
-        EXPORTERS["csv"].write(DESIGN, RAYS, tmp_path / "a.csv", robot=RobotFile(tmp_path / "robot.xml"))
-    notes = EXPORTERS["mjcf"].write(replace(DESIGN, mount="torso"), RAYS, tmp_path / "a.xml")
+        write_as("csv", DESIGN, RAYS, tmp_path / "a.csv", robot=RobotFile(tmp_path / "robot.xml"))
+    notes = write_as("mjcf", replace(DESIGN, mount="torso"), RAYS, tmp_path / "a.xml")
     assert any("the robot's body 'torso'; --robot MODEL" in note for note in notes)
 
 
@@ -267,7 +268,7 @@ def test_a_ray_along_any_axis_is_a_site_that_looks_there(tmp_path):
     axes = np.concatenate([np.eye(3), -np.eye(3)])
     path = tmp_path / "axes.xml"
     for one in DESIGN.sensors:
-        EXPORTERS["mjcf"].write(DesignSpec("axes", (one,)), rays_along(axes, (0.0, 0.0)), path)
+        write_as("mjcf", DesignSpec("axes", (one,)), rays_along(axes, (0.0, 0.0)), path)
         _, data = simulated(path)
         np.testing.assert_allclose(data.site_xmat.reshape(-1, 3, 3)[:, :, 2], axes, atol=1e-15)
         np.testing.assert_allclose(data.site_xpos, 0.0, atol=1e-15)
@@ -276,7 +277,7 @@ def test_a_ray_along_any_axis_is_a_site_that_looks_there(tmp_path):
 def test_two_sensors_of_one_name_are_two_bodies(tmp_path):
     twins = DesignSpec("twins", (DESIGN.sensors[0], DESIGN.sensors[0]))
     path = tmp_path / "twins.xml"
-    EXPORTERS["mjcf"].write(twins, twins.rays(2), path)
+    write_as("mjcf", twins, twins.rays(2), path)
     model, _ = simulated(path)
     assert {model.body(index).name for index in (1, 2)} == {"front left", "front left 2"}
 
@@ -286,18 +287,18 @@ def test_no_name_is_a_word_of_the_format(reader, tmp_path):
         design = DesignSpec(name, tuple(replace(one, name=name) for one in DESIGN.sensors[:1]))
         rays = RAYS.subset(RAYS.sensor == 0)
         path = tmp_path / "named"
-        EXPORTERS["mjcf"].write(design, rays, path)
+        write_as("mjcf", design, rays, path)
         assert simulated(path)[0].nsensor == len(rays)
         if name in ("world", "__model__"):
-            EXPORTERS["sdf"].write(design, rays, path)
+            write_as("sdf", design, rays, path)
             check_gazebo(read_sdf(reader, path), design, rays, 1e-9)
 
 
 @pytest.mark.parametrize("name", ["mjcf", "sdf"])
 def test_what_is_written_for_a_simulator_is_a_design_again(tmp_path, name):
     design, rays = spinning()
-    path = tmp_path / f"spin{EXPORTERS[name].suffix}"
-    EXPORTERS[name].write(design, rays, path)
+    path = tmp_path / f"spin{FORMATS.load(name).suffix}"
+    write_as(name, design, rays, path)
     found = load_design(path).rays()
     assert len(found) == len(rays)
     assert farthest_nearest(rays.direction, found.direction) < 1e-7
@@ -346,7 +347,7 @@ def test_gazebo_fires_the_rays_that_are_on_even_grids(reader, exported):
 def test_a_spinning_sensor_is_one_whole_turn(reader, tmp_path):
     design, rays = spinning()
     path = tmp_path / "spin.sdf"
-    notes = EXPORTERS["sdf"].write(design, rays, path, rate_hz=20.0)
+    notes = write_as("sdf", design, rays, path, rate_hz=20.0)
     check_gazebo(read_sdf(reader, path), design, rays, 1e-9, rate_hz=20.0)
     assert not any("even grid" in note for note in notes)
 
@@ -375,7 +376,7 @@ def test_urdfdom_finds_a_link_per_sensor(exported):
 def test_no_sensor_takes_the_name_of_what_holds_it(tmp_path, name):
     one = replace(DESIGN.sensors[0], name=name)
     path = tmp_path / "named.urdf"
-    EXPORTERS["urdf"].write(DesignSpec(name, (one,)), RAYS.subset(RAYS.sensor == 0), path)
+    write_as("urdf", DesignSpec(name, (one,)), RAYS.subset(RAYS.sensor == 0), path)
     assert len(check_urdf(path)) == 2
 
 
@@ -415,7 +416,7 @@ def test_what_a_format_cannot_hold_is_counted(exported, words):
 @pytest.mark.parametrize("rate_hz", [np.nan, np.inf, 0.0, -1.0, 1e-320, 1e300])
 def test_no_sensor_has_such_a_frame_rate(tmp_path, rate_hz):
     with pytest.raises(ConfigError, match=r"0\.001 to 1e"):
-        EXPORTERS["sdf"].write(DESIGN, RAYS, tmp_path / "out", rate_hz)
+        write_as("sdf", DESIGN, RAYS, tmp_path / "out", rate_hz)
     assert not list(tmp_path.iterdir())
 
 
@@ -431,7 +432,7 @@ def test_names_cannot_leave_their_attribute(exported, name):
 
 
 def test_libsdformat_finds_the_sensors_of_a_ray_pattern_plugin_where_they_stand(reader, tmp_path):
-    EXPORTERS["rgl"].write(DESIGN, RAYS, tmp_path / "rig.rgl")
+    write_as("rgl", DESIGN, RAYS, tmp_path / "rig.rgl")
     found = read_sdf(reader, tmp_path / "rig.rgl" / "model.sdf")
     assert [sensor["name"] for sensor in found] == [mount.name for mount in mounts(DESIGN, RAYS)]
     for sensor, mount in zip(found, mounts(DESIGN, RAYS), strict=True):

@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.exports import write_as
 from support.sensors import normal_sensor
 from support.transients import no_simulator
 
 from lidardesign.errors import ConfigError, DataError
+from lidardesign.formats import FORMATS
 from lidardesign.formats.mounts import mounts
-from lidardesign.formats.registry import EXPORTERS
 from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.design import DesignSpec
 
@@ -26,7 +27,7 @@ PIXEL_M = 0.0149896229
 
 EXACT, FLOAT32 = 1e-14, 1e-6
 # Of any rays, with gates and places of their own.
-FORMATS = ("csv", "npz", "sensors-csv", *MINE)
+ANY_RAYS = ("csv", "npz", "sensors-csv", *MINE)
 
 
 def design(names=NASTY, roll=True):
@@ -73,13 +74,13 @@ def written(tmp_path_factory):
     root = tmp_path_factory.mktemp("exports")
     found = {}
     for number, (case, rays) in enumerate(CASES.items()):
-        for name in FORMATS:
-            path = root / f"{number}{EXPORTERS[name].suffix}"
-            found[name, case] = path, EXPORTERS[name].write(DESIGN, rays, path)
+        for name in ANY_RAYS:
+            path = root / f"{number}{FORMATS.load(name).suffix}"
+            found[name, case] = path, write_as(name, DESIGN, rays, path)
     return found
 
 
-@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("name", ANY_RAYS)
 def test_every_format_says_that_it_does_not_hold_the_constraints(written, name):
     for case in CASES:
         assert any("constraints" in note for note in written[name, case][1])
@@ -97,42 +98,34 @@ def test_names_of_files_are_plain_whatever_the_sensors_are_called(written, name)
 @pytest.mark.parametrize("name", ["helios", "osi", "rgl", "mitsuba"])
 def test_sensors_that_fire_nothing_are_left_out_and_told(tmp_path, name):
     rays = CASES["mounted"].subset(CASES["mounted"].sensor % 2 == 0)
-    notes = EXPORTERS[name].write(DESIGN, rays, tmp_path / "out")
+    notes = write_as(name, DESIGN, rays, tmp_path / "out")
     assert "3 of 6 sensors fire no ray and are left out" in notes
 
 
-@pytest.mark.parametrize("name", [name for name in EXPORTERS if name not in ("csv", "npz", "galvo", "sensors-csv")])
+@pytest.mark.parametrize("name", sorted({*FORMATS.names()} - {"csv", "npz", "galvo", "sensors-csv"}))
 def test_formats_made_of_rays_refuse_a_design_without_them_and_others_take_it(tmp_path, name):
-    none, exporter = CASES["mounted"].subset(np.arange(0)), EXPORTERS[name]
+    none = CASES["mounted"].subset(np.arange(0))
     if name in ("helios", "osi", "rgl", "mitsuba"):
         with pytest.raises(DataError, match="no rays"):
-            exporter.write(DESIGN, none, tmp_path / "out")
+            write_as(name, DESIGN, none, tmp_path / "out")
         assert not list(tmp_path.iterdir())
         return
-    notes = exporter.write(DESIGN, none, tmp_path / "out")
+    notes = write_as(name, DESIGN, none, tmp_path / "out")
     assert ("6 of 6 sensors fire no ray and are left out" in notes) == (name not in ("ply", "stl", "mounts"))
 
 
-@pytest.mark.parametrize("name", EXPORTERS)
-def test_a_format_holds_its_frame_rate_or_refuses_one(tmp_path, name):
-    exporter, path, rays = EXPORTERS[name], tmp_path / "out", NARROW
-    if not exporter.rated:
-        with pytest.raises(ConfigError, match="cannot hold a frame rate"):
-            exporter.write(DESIGN, rays, path, 25.0)
-        return
-    found = []
-    for rate_hz in (10.0, 25.0):
-        exporter.write(DESIGN, rays, path, rate_hz)
-        found.append([file.read_bytes() for file in (sorted(path.iterdir()) if exporter.folder else [path])])
-    assert found[0] != found[1]
+@pytest.mark.parametrize("name", [name for name in FORMATS.names() if "rate" not in FORMATS.load(name).holds])
+def test_a_format_without_a_frame_rate_refuses_one(tmp_path, name):
+    with pytest.raises(ConfigError, match="cannot hold a frame rate"):
+        write_as(name, DESIGN, NARROW, tmp_path / "out", 25.0)
 
 
 def test_files_that_an_earlier_export_left_in_a_folder_are_told(tmp_path):
     path = tmp_path / "out"
-    EXPORTERS["helios"].write(DESIGN, CASES["mounted"], path)
+    write_as("helios", DESIGN, CASES["mounted"], path)
     (path / "Mine.xml").write_text("<document/>", encoding="utf-8")
     fewer = CASES["mounted"].subset(CASES["mounted"].sensor == 0)
-    notes = EXPORTERS["helios"].write(DESIGN, fewer, path)
+    notes = write_as("helios", DESIGN, fewer, path)
     (note,) = (note for note in notes if note.startswith("the folder also holds 6 other files"))
     assert "Mine.xml" in note
     assert (path / "Mine.xml").read_text(encoding="utf-8") == "<document/>"
@@ -194,7 +187,7 @@ def test_helios_files_are_valid(written, case):
 
 
 def test_helios_takes_whole_frame_rates_and_says_so(tmp_path):
-    notes = EXPORTERS["helios"].write(DESIGN, CASES["mounted"], tmp_path / "out", rate_hz=7.5)
+    notes = write_as("helios", DESIGN, CASES["mounted"], tmp_path / "out", rate_hz=7.5)
     assert any(note.startswith("7.5 frames per second became 8") for note in notes)
     assert helios_pulses(tmp_path / "out", next((tmp_path / "out").glob("con.survey.xml")))
 
@@ -233,7 +226,7 @@ def test_osi_fires_nothing_in_the_next_frame(tmp_path, rate_hz):
     rays = CASES["mounted"]
     late = Rays(rays.origin_m, rays.direction, rays.gate_m, rays.sensor, np.linspace(0, 0.1, len(rays), endpoint=False))
     late.time_s[-1] = np.nextafter(0.1, 0)
-    EXPORTERS["osi"].write(DESIGN, late, tmp_path / "out.json", rate_hz=rate_hz)
+    write_as("osi", DESIGN, late, tmp_path / "out.json", rate_hz=rate_hz)
     whole = json.loads((tmp_path / "out.json").read_text(encoding="utf-8"))
     times_us = [time for lidar in whole["lidarSensorViewConfiguration"] for time in lidar["timings"]]
     assert 0 <= min(times_us) <= max(times_us) < min(1e6 / rate_hz, 2**32)
@@ -243,7 +236,7 @@ def test_osi_fires_nothing_in_the_next_frame(tmp_path, rate_hz):
 @pytest.mark.parametrize("rate_hz", [1e-5, 1e10])
 def test_osi_refuses_frames_whose_times_it_cannot_count(tmp_path, rate_hz):
     with pytest.raises(ConfigError, match="rate-hz"):
-        EXPORTERS["osi"].write(DESIGN, CASES["mounted"], tmp_path / "out", rate_hz=rate_hz)
+        write_as("osi", DESIGN, CASES["mounted"], tmp_path / "out", rate_hz=rate_hz)
 
 
 # Robotec GPU Lidar --------------------------------------------------------------------------------------------------
@@ -276,7 +269,7 @@ def test_rgl_patterns_look_along_the_third_axis_of_proper_poses(written, case):
 
 
 def test_rgl_times_follow_the_frame_rate(tmp_path):
-    EXPORTERS["rgl"].write(DESIGN, CASES["mounted"], tmp_path / "out", rate_hz=40.0)
+    write_as("rgl", DESIGN, CASES["mounted"], tmp_path / "out", rate_hz=40.0)
     times_ms = np.concatenate([np.fromfile(file, "<f4") for file in (tmp_path / "out").glob("*.time1f")])
     np.testing.assert_allclose(np.sort(times_ms), CASES["mounted"].time_s * 1e3 / 4, rtol=1e-6)
 
@@ -327,7 +320,7 @@ def rendered(tmp_path_factory):
     rays = rays_of(some, count=40)
     rays = Rays(rays.origin_m, rays.direction, np.tile(GATE_M, (len(rays), 1)), rays.sensor, rays.time_s)
     folder = tmp_path_factory.mktemp("mitsuba")
-    EXPORTERS["mitsuba"].write(some, rays, folder / "out")
+    write_as("mitsuba", some, rays, folder / "out")
     scenes = []
     for file in sorted((folder / "out").iterdir()):
         scenes.append(folder / f"with_floor_{file.name}")
@@ -432,7 +425,7 @@ def test_ply_frusta_hold_what_lies_in_the_field_of_view_and_gate(written):
 
 def test_ply_leaves_out_frusta_that_have_no_width(tmp_path):
     some = DesignSpec("ray", (normal_sensor("thin", spread_rad=(0.0, 0.0)),))
-    notes = EXPORTERS["ply"].write(some, rays_of(some, count=1), tmp_path / "out")
+    notes = write_as("ply", some, rays_of(some, count=1), tmp_path / "out")
     assert "1 of 1 sensors have no width, so no frustum" in notes
     assert sorted(file.name for file in (tmp_path / "out").iterdir()) == ["beams.ply", "rays.ply"]
 
@@ -459,8 +452,8 @@ def test_names_that_look_like_the_format_do_not_become_part_of_it(tmp_path):
     some = design(("endsolid x", "facet normal 0 0 1", "element vertex 9\nend_header\n", "\U0001f600" * 5000))
     rays = rays_of(some)
     for name in MINE:
-        path = tmp_path / f"out{EXPORTERS[name].suffix}"
-        EXPORTERS[name].write(some, rays, path)
+        path = tmp_path / f"out{FORMATS.load(name).suffix}"
+        write_as(name, some, rays, path)
     assert len(trimesh.load(tmp_path / "out.stl", file_type="stl_ascii").geometry) == 4
     header = (tmp_path / "out.ply.d" / "rays.ply").read_bytes().partition(b"end_header\n")[0]
     assert max(map(len, header.splitlines())) < 1024
@@ -470,5 +463,5 @@ def test_names_that_look_like_the_format_do_not_become_part_of_it(tmp_path):
 @pytest.mark.parametrize(("name", "what"), [("stl", "solids"), ("ply", "frusta")])
 def test_shapes_of_sensors_that_are_regions_stand_in_their_middles_and_say_so(tmp_path, name, what):
     some = DesignSpec("region", (normal_sensor("wide", origin_covariance_m2=np.diag([1.0, 0, 0])),))
-    notes = EXPORTERS[name].write(some, rays_of(some), tmp_path / "out")
+    notes = write_as(name, some, rays_of(some), tmp_path / "out")
     assert any("1 sensors are regions" in note and f"1 m: {what} stand in their middles" in note for note in notes)

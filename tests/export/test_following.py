@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.exports import write_as
 from support.rigs import rig
 from support.strategies import adaptive_designs
 
 from lidardesign.errors import ConfigError
+from lidardesign.formats import FORMATS
 from lidardesign.formats.ray_lists import ray_columns
-from lidardesign.formats.registry import EXPORTERS
 from lidardesign.scenes.rays import Outcome, Returns
 from lidardesign.sensors.adaptive import AdaptivePatterns, PatternRule
 
@@ -24,7 +25,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "adaptive.md"
 
 def exported(design, name, folder):
     path = folder / f"follow.{name}"
-    EXPORTERS[name].write(design, design.adaptive.patterns[0].at(), path)
+    write_as(name, design, design.adaptive.patterns[0].at(), path)
     return path
 
 
@@ -79,7 +80,7 @@ def test_a_csv_has_the_rays_and_the_rule_to_the_last_bit(tmp_path_factory, desig
     assert all(np.array_equal(np.ravel(rule[name]), table[name].ravel()) for name in rule)
 
 
-@pytest.mark.parametrize("name", [name for name in EXPORTERS if name not in ("csv", "npz", "sensors-csv", "stl")])
+@pytest.mark.parametrize("name", [name for name in FORMATS.names() if name not in ("csv", "npz", "sensors-csv", "stl")])
 def test_formats_that_cannot_hold_them_refuse_and_say_so(tmp_path, name):
     design, _ = rig()
     following = AdaptivePatterns(PatternRule(np.zeros((1, 1)), 1, np.ones(1)), design.patterns * 2, np.ones(2) / 2)

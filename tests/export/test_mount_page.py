@@ -12,10 +12,10 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from support.exports import write_as
 from support.rigs import NASTY, rig
 
 from lidardesign.formats.mount_page import mounted_parts
-from lidardesign.formats.registry import EXPORTERS
 from lidardesign.parts.catalogue import Pose, find_part, part_design
 from lidardesign.scenes.rays import rotation_of_quaternion
 
@@ -30,7 +30,7 @@ poses = st.builds(
 
 def written(design, folder, count=None):
     rays = design.rays(design.count if count is None else count)
-    notes = EXPORTERS["mounts"].write(design, rays, folder)
+    notes = write_as("mounts", design, rays, folder)
     with (folder / "mounts.csv").open(encoding="utf-8", newline="") as file:
         return list(csv.DictReader(file)), notes
 
@@ -120,7 +120,7 @@ def test_nothing_in_a_name_becomes_markup(tmp_path):
 def test_no_link_is_the_one_that_it_is_mounted_on(tmp_path):
     design, rays = rig()
     sensors = tuple(replace(one, name=name) for one, name in zip(design.sensors, ("base", "s", "t", "u"), strict=False))
-    EXPORTERS["mounts"].write(replace(design, sensors=sensors, mount="base_link"), rays, tmp_path)
+    write_as("mounts", replace(design, sensors=sensors, mount="base_link"), rays, tmp_path)
     links = [link.get("name") for link in ElementTree.parse(tmp_path / "mounts.urdf").findall("link")]
     assert len(set(links)) == len(links) == len(sensors) + 1
 

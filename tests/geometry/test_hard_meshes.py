@@ -12,9 +12,9 @@ from support.meshes import BOX_FACES, BOX_VERTICES, write_box
 
 from lidardesign.density.fields.distance import BodyField, TableField, build_field
 from lidardesign.errors import DataError
+from lidardesign.evaluation.accuracy.fields import exact_distances
 from lidardesign.scenes.mesh_files import SUFFIXES, check_mesh, load_mesh, signed_volume_m3
 from lidardesign.scenes.scene import Body, Mesh, Scene, Sphere, rigid
-from lidardesign.evaluation.accuracy.fields import exact_distances
 
 BALL = trimesh.creation.icosphere(subdivisions=2, radius=0.5)
 RING = trimesh.creation.torus(0.4, 0.15, major_sections=24, minor_sections=12)

@@ -13,11 +13,11 @@ from scipy.spatial.transform import Rotation
 from support import references
 
 from lidardesign.errors import ConfigError
+from lidardesign.evaluation.score import slipped_notes
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Scene, Sphere, rigid
 from lidardesign.scenes.triangles import BESIDE_SHARE, SecondCasts
-from lidardesign.evaluation.score import slipped_notes
 from lidardesign.scoring.scene_scores import score_in_scene
 from lidardesign.simulate.plan import Planner
 from lidardesign.task import Metric, Score

@@ -23,10 +23,10 @@ from lidardesign.density.training.learn import make_flow
 from lidardesign.density.training.trainer import CHECKPOINT, Trainer
 from lidardesign.errors import ConfigError, DataError, LidardesignError
 from lidardesign.formats.designs import load_design
-from lidardesign.registry import load_task
 from lidardesign.run.manifest import record, start_manifest
 from lidardesign.run.yaml import parse_yaml
 from lidardesign.simulate.detector.files import load_detector
+from lidardesign.task import load_task
 
 REFUSED = {
     "an alias bomb": "".join(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}' if n else '1'] * 10)}]\n" for n in range(7)),

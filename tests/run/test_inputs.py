@@ -17,6 +17,7 @@ from lidardesign_tasks.poses import read_poses
 from lidardesign.config import load_run_config
 from lidardesign.density.training.checkpoint import load_arrays
 from lidardesign.errors import ConfigError, DataError
+from lidardesign.evaluation.captures.capture import load_capture
 from lidardesign.formats.designs import load_design
 from lidardesign.formats.galvo import read_galvo
 from lidardesign.formats.ray_lists import read_ray_csv, read_sensor_csv
@@ -29,7 +30,6 @@ from lidardesign.run.xml import read_xml
 from lidardesign.run.yaml import load_yaml
 from lidardesign.scenes.mesh_files import SUFFIXES, list_mesh_files, load_mesh
 from lidardesign.scenes.mujoco_models import model_files
-from lidardesign.evaluation.captures.capture import load_capture
 from lidardesign.simulate.detector.files import load_detector
 
 DOCS = Path(__file__).parents[2] / "docs" / "formats.md"

@@ -11,9 +11,9 @@ from support.scoring import make_request
 from support.sensors import normal_sensor
 from support.synthetic_light import PHOTON_EFFECTS
 
+from lidardesign.evaluation.entries import entries_of
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Ambient, Body, Medium, Scene, Sphere
-from lidardesign.evaluation.entries import entries_of
 from lidardesign.scoring.fired import ONE_DEVICE, Devices, assign_devices
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.simulate.detector.files import load_detector

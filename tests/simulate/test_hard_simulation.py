@@ -21,10 +21,10 @@ from support.scoring import design, make_request, rows_by_key
 
 from lidardesign.density.training.learn import refuse_blind_receiver
 from lidardesign.errors import DataError
+from lidardesign.evaluation.score import evaluate
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import Outcome, Rays, path_of_range, path_windows, range_of_path
 from lidardesign.scenes.scene import Body, Box, Plane, Receiver, Scene, Sphere, rigid
-from lidardesign.evaluation.score import evaluate
 from lidardesign.scoring.metrics import (
     chamfer_m,
     delaunay_surface,

@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 from support.transients import binned, flood, needs_simulator, pixel_rays, rays_from, spiral, spot
 
 from lidardesign.errors import ConfigError, NumericalError
-from lidardesign.registry import load_task
 from lidardesign.scenes.casting import shared_caster
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import (
@@ -37,6 +36,7 @@ from lidardesign.simulate.effects.motion import still_tracer
 from lidardesign.simulate.effects.shadowing import visible_echoes
 from lidardesign.simulate.light_transport import transport as process
 from lidardesign.simulate.light_transport.transport import Lights, PathBins, render_transient
+from lidardesign.task import load_task
 
 # float32 intersections against float64 ones: 1e-7 of lengths, some ten times that where surfaces are curved or grazed
 ENERGY, MOST_ENERGY = 1e-5, 5e-3

@@ -18,9 +18,9 @@ from lidardesign.constraints.check import check_design
 from lidardesign.constraints.document import Constraints
 from lidardesign.constraints.feasibility import check_feasible
 from lidardesign.errors import InfeasibleError
-from lidardesign.registry import load_task
 from lidardesign.run.yaml import dump_yaml
 from lidardesign.space import DesignSpace
+from lidardesign.task import load_task
 
 PLANS = [random_plan(seed) for seed in range(300)]
 # Runs that are whole after a second of learning, one with chosen rays and one with even ones.

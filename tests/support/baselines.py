@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from lidardesign.scoring.baselines.simple import Baselines
 
 from lidardesign.scenes.scene import Body, Scene, Sphere, rigid
-from lidardesign.scoring.baselines.simple import Baselines
 
 
 def balls(centre, radius=0.4, jitter=0.05, count=3, seed=8):

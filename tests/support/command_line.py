@@ -12,9 +12,9 @@ import pytest
 
 from lidardesign.cli.main import run as run_program
 from lidardesign.config import resolve, save_run_config
-from lidardesign.registry import load_task
 from lidardesign.run.manifest import start_manifest
 from lidardesign.samples import Samples, save_samples
+from lidardesign.task import load_task
 from support.spaces import log_volume
 
 

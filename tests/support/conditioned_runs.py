@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from lidardesign.config import resolve, save_run_config
-from lidardesign.registry import load_task
 from lidardesign.run.manifest import start_manifest
 from lidardesign.samples import Samples, save_samples
+from lidardesign.task import load_task
 from support.spaces import log_volume
 
 

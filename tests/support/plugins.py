@@ -39,7 +39,9 @@ class Task:
 """
 
 
-def install_plugins(place: Path, sources: dict[str, str], package: str = "plugins", module: str = "") -> None:
+def install_plugins(
+    place: Path, sources: dict[str, str], package: str = "plugins", module: str = "", group: str = "lidardesign.tasks"
+) -> None:
     """Install a package of plugins by name into a folder that is on the path.
 
     Arguments:
@@ -47,12 +49,14 @@ def install_plugins(place: Path, sources: dict[str, str], package: str = "plugin
         sources: Python by the name of the entry point; NAME in it becomes that name.
         package: Its name.
         module: What its modules' names begin with; by default the package's name.
+        group: The entry-point group.
     """
     made = place / f"{package}-1.0.dist-info"
     made.mkdir(parents=True)
     (made / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
     prefix = module or package
-    lines = [f"{name} = {prefix}_{name}:Task" for name in sources]
-    (made / "entry_points.txt").write_text("\n".join(["[lidardesign.tasks]", *lines, ""]))
+    kind = "Task" if group == "lidardesign.tasks" else "Plugin"
+    lines = [f"{name} = {prefix}_{name}:{kind}" for name in sources]
+    (made / "entry_points.txt").write_text("\n".join([f"[{group}]", *lines, ""]))
     for name, source in sources.items():
         (place / f"{prefix}_{name}.py").write_text(source.replace("NAME", name))

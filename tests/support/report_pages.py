@@ -8,6 +8,7 @@ import numpy as np
 
 from lidardesign.constraints.check import ConstraintCheck
 from lidardesign.constraints.slack import constraint_slack
+from lidardesign.evaluation.results import Evaluation, Paired
 from lidardesign.report.density_views import density_view
 from lidardesign.report.page import Report
 from lidardesign.report.scene_figure import scene_figure
@@ -16,7 +17,6 @@ from lidardesign.samples import Samples
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import Outcome, Rays, gate_outcomes
 from lidardesign.scenes.scene import Body, Box, Capsule, Plane, Scene, Sphere, rigid
-from lidardesign.evaluation.results import Evaluation, Paired
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.space import DesignSpace
 from lidardesign.task import Metric

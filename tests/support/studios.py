@@ -8,9 +8,9 @@ import numpy as np
 
 from lidardesign.config import resolve, save_run_config
 from lidardesign.density.objective.proposals import samples_without_visibility
-from lidardesign.registry import load_task
 from lidardesign.run.manifest import start_manifest
 from lidardesign.samples import save_samples
+from lidardesign.task import load_task
 
 PATIENCE_S = 60.0
 # A torso with an arm before it, whose end is looked for.

@@ -7,8 +7,8 @@ import math
 import numpy as np
 from lidardesign_tasks.flatland import FlatlandConfig, FlatlandTask
 
-from lidardesign.scenes.rays import Rays
 from lidardesign.evaluation.request import EvaluationRequest
+from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.design import DesignSpec
 from support.sensors import normal_sensor
 

@@ -22,7 +22,6 @@ from lidardesign.contract.contract import LAWS
 from lidardesign.density.training.learn import prepare_training_data
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.rays.information import require_valid
-from lidardesign.registry import load_task
 from lidardesign.run.manifest import note, start_manifest
 from lidardesign.run_folder import RunFolder, input_hashes
 from lidardesign.scenes.rays import Outcome, Returns
@@ -30,6 +29,7 @@ from lidardesign.scenes.scene import Sphere
 from lidardesign.scenes.surface import sample_body
 from lidardesign.simulate.returns import simulate
 from lidardesign.space import aim
+from lidardesign.task import load_task
 
 TASK = MujocoTask()
 ROBOT = """<mujoco><worldbody>

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from lidardesign.scoring.baselines.candidates import rays_at
 from lidardesign_tasks.arm import ArmTask
 from lidardesign_tasks.emitter import EmitterTask
 from lidardesign_tasks.face import FaceTask
@@ -21,7 +22,6 @@ from support.meshes import write_ball
 from support.rays import rays_along, rays_of_points
 
 from lidardesign.scenes.scene import Body, Box, Mesh, Scene, rigid
-from lidardesign.scoring.baselines.candidates import rays_at
 from lidardesign.scoring.scene_scores import checked_score, score_lists
 from lidardesign.simulate.detector.physics import Detector, Physics
 from lidardesign.simulate.returns import build_casters, simulate

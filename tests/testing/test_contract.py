@@ -15,9 +15,8 @@ from lidardesign.contract import BrokenLawError, check_task, contract_of
 from lidardesign.contract.contract import LAWS
 from lidardesign.contract.law import fingerprint, geometry_fingerprint
 from lidardesign.errors import ConfigError, PluginError
-from lidardesign.registry import load_task
 from lidardesign.scenes.scene import Body, Medium, Mesh, Scene, Sphere
-from lidardesign.task import mount_of
+from lidardesign.task import load_task, mount_of
 
 METRIC = 'Metric("radius error", "mm", "lower", worst=100.0, tolerance=0.5)'
 DEFAULTS = 'Defaults(density={"sigma_m": 0.05})'

@@ -9,10 +9,10 @@ import pytest
 from support.command_line import caller, files_under
 from support.plugins import GOOD, install_plugins
 
-from lidardesign import registry
 from lidardesign.contract.contract import LAWS
 from lidardesign.contract.process import CheckRequest, check_in_process
 from lidardesign.errors import ConfigError
+from lidardesign.task import load_task
 
 SCENES = "    def scenes(self, config, split, seed):\n"
 
@@ -93,7 +93,7 @@ def test_an_unusual_plugin_keeps_every_law_that_applies(findings):
 def test_none_of_them_is_imported_here_or_spoils_the_others(findings, place, tmp_path, monkeypatch, capsys):
     own = {f"{package}_{name}" for package in ("plugins", "first", "second") for name in findings}
     assert not own & {*sys.modules}
-    assert registry.load_task("flatland").name == "flatland"
+    assert load_task("flatland").name == "flatland"
     result = caller(capsys, tmp_path, monkeypatch)("tasks", "check", "wrong_types", "--json")
     assert result.code == 6
     assert (result.json["keeps"], result.json["task"]) == (False, "wrong_types")

@@ -20,8 +20,8 @@ from lidardesign.run.clock import phase
 from lidardesign.run.outputs import check_outputs
 
 if TYPE_CHECKING:
-    from lidardesign.scenes.rays import Rays
     from lidardesign.evaluation.captures.score import CaptureEvaluation
+    from lidardesign.scenes.rays import Rays
 
 COLUMNS = {
     "rays": "rays",

@@ -37,7 +37,7 @@ def init(
     _check_new(out)
     with phase("libraries"):
         from lidardesign.api.config_reference import config_template
-        from lidardesign.registry import load_task
+        from lidardesign.task import load_task
 
     plugin = load_task(task)
     document, text = config_template(
@@ -65,7 +65,7 @@ def schema(
     """Print a JSON Schema. KIND is config, constraints, design, or evaluate for what `evaluate --json` prints."""
     with phase("libraries"):
         from lidardesign.api.config_reference import SCHEMA_KINDS, schema_of
-        from lidardesign.registry import load_task
+        from lidardesign.task import load_task
 
     check_choice(kind, "KIND", SCHEMA_KINDS)
     if task is not None and kind != "config":

@@ -1,4 +1,4 @@
-"""`lidardesign export`: write a design for other programs."""
+"""`lidardesign export`: write a design for other programs; `lidardesign formats`: the formats that it can take."""
 
 from __future__ import annotations
 
@@ -10,9 +10,11 @@ import typer
 
 from lidardesign.choices.files import ExportChoices, ExportCommand
 from lidardesign.choices.flag import complete
-from lidardesign.choices.shared import Printed
-from lidardesign.cli.terminal.grids import RichConsole, text_table
-from lidardesign.cli.terminal.options import command_line
+from lidardesign.choices.listings import LawChoices
+from lidardesign.choices.shared import Brief, Printed
+from lidardesign.cli.commands.tasks import list_plugins, show_plugin, try_laws
+from lidardesign.cli.terminal.grids import RichConsole
+from lidardesign.cli.terminal.options import command_line, formats
 from lidardesign.cli.terminal.output import Output, announce, keep_times, written_file
 from lidardesign.errors import ConfigError
 from lidardesign.run.clock import phase
@@ -38,29 +40,22 @@ def export(
     **given: Any,
 ) -> None:
     """Write a design in another program's format."""
-    with phase("libraries"):
-        from lidardesign.api.export import (
-            DesignSource,
-            ExportRequest,
-            export_target,
-            exporter_of,
-        )
-        from lidardesign.formats.designs import read_design
-
     if list_formats:
         return _list(output)
+    with phase("libraries"):
+        from lidardesign.api.export import DesignSource, ExportRequest, export_target, format_of
+        from lidardesign.formats.designs import read_design
+
     if design is None:
         raise ConfigError("no design was given", where="DESIGN", hint="lidardesign export --list shows the formats")
-    choices = complete(ExportChoices, given)
-    exporter = exporter_of(format)
+    choices, chosen = complete(ExportChoices, given), format_of(format)
     source = DesignSource(read_design(design, output.remark), path=design)
-    target = export_target(design, out, exporter)
-    robot = choices["robot"]
-    request = ExportRequest(source, exporter, target, choices["rays"], choices["at"], choices["rate_hz"], robot)
+    target, robot = export_target(design, out, chosen.suffix), choices["robot"]
+    request = ExportRequest(source, chosen, target, choices["rays"], choices["at"], choices["rate_hz"], robot)
     announce([target], output)
-    check_outputs({"--out": target}, [robot] if robot else [], ("--out",) if exporter.folder else ())
+    check_outputs({"--out": target}, [robot] if robot else [], ("--out",) if chosen.is_folder else ())
     notes: list[str] = []
-    with written_file(target, exporter.suffix) as file:
+    with written_file(target, chosen.suffix) as file:
         exported = request.write(file, notes.append)
     for note in notes:
         if output.verbose or note not in exported.notes:
@@ -80,11 +75,37 @@ def export(
     output.result(document, show, files={"wrote": target} if output.quiet else None, says_time=True)
 
 
-def _list(output: Output) -> None:
-    from lidardesign.formats.registry import EXPORTERS
+formats_app = typer.Typer(help="List, show or check formats of exports.", no_args_is_help=True)
+FormatName = Annotated[str, typer.Argument(metavar="NAME", help="Name of a format.", autocompletion=formats)]
 
-    keys = ("suffix", "summary", "reader", "checked", "folder")
-    formats = [{"name": name, **{key: getattr(exporter, key) for key in keys}} for name, exporter in EXPORTERS.items()]
-    headings = ("format", "suffix", "what it is", "for", "how that is checked")
-    rows = [[entry[key] for key in ("name", *keys[:-1])] for entry in formats]
-    output.result({"formats": formats}, lambda rich: rich.print(text_table(headings, rows)), show_costs=False)
+
+@formats_app.command("list")
+@command_line(Brief)
+def list_(output: Output) -> None:
+    """List the installed formats; a broken one with its reason."""
+    _list(output)
+
+
+def _list(output: Output) -> None:
+    from lidardesign.formats import FORMATS
+
+    shown = {"format": "name", "suffix": "suffix", "what it is": "summary", "for": "reader"}
+    list_plugins(FORMATS, {**shown, "how that is checked": "checked"}, output)
+
+
+@formats_app.command("show")
+@command_line(Brief)
+def show(output: Output, name: FormatName) -> None:
+    """Show a format: what it is, who reads it, and what it holds."""
+    from lidardesign.formats import FORMATS
+
+    show_plugin(FORMATS, name, output)
+
+
+@formats_app.command("check")
+@command_line(LawChoices, Brief)
+def check(output: Output, name: FormatName, *, seconds: float) -> None:
+    """Check that a format keeps the contract. Every law is tried; exit 6 where one does not hold."""
+    from lidardesign.contract.process import CheckRequest
+
+    try_laws(CheckRequest(name, limit_s=seconds, noun="format"), output)

@@ -19,6 +19,7 @@ from lidardesign.run.files import check_lock
 from lidardesign.run.outputs import check_writable
 
 if TYPE_CHECKING:
+    from lidardesign.api.problems import MethodRequest
     from lidardesign.fitting.request import FitRequest
 
 
@@ -30,13 +31,13 @@ def fit(
 ) -> None:
     """Fit sensors to the density of RUN."""
     with phase("libraries"):
-        from lidardesign.fitting.request import FitRequest
+        from lidardesign.api.problems import problem_of
         from lidardesign.run_folder import RunFolder
 
-    run_fit(FitRequest.resolve(RunFolder.open(run), choices, notes=output.remark), output, choices)
+    run_fit(problem_of(RunFolder.open(run), choices, notes=output.remark), output, choices)
 
 
-def run_fit(request: FitRequest, output: Output, choices: FitChoices) -> None:
+def run_fit(request: FitRequest | MethodRequest, output: Output, choices: FitChoices) -> None:
     """Fit the design of a request, save it, and give the result."""
     from lidardesign.api.design import Design
     from lidardesign.sensors.design_file import design_text
@@ -73,12 +74,12 @@ def constrain(
 ) -> None:
     """Fit sensors again under constraints; nothing is learned again."""
     with phase("libraries"):
+        from lidardesign.api.problems import problem_of
         from lidardesign.constraints.document import Constraints, load_constraints, split_settings
-        from lidardesign.fitting.request import FitRequest
         from lidardesign.formats.designs import need_run, open_target
 
     opened, design = open_target(target, output.remark)
     run = need_run(opened, target)
     bounds, choices["settings"] = split_settings(choices.get("settings", ()), run.task)
     choices["constraints"] = load_constraints(choices.get("constraints"), bounds, output.remark) or Constraints()
-    run_fit(FitRequest.resolve(run, choices, design, notes=output.remark), output, choices)
+    run_fit(problem_of(run, choices, design, notes=output.remark), output, choices)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -17,6 +17,10 @@ from lidardesign.cli.terminal.options import command_line
 from lidardesign.cli.terminal.output import Output
 from lidardesign.errors import pasted
 from lidardesign.run.clock import phase
+
+if TYPE_CHECKING:
+    from lidardesign.contract.process import CheckRequest
+    from lidardesign.plugins import PluginKind
 
 OUTCOMES = {"pass": ("pass", "green"), "fail": ("FAIL", "bold red"), "skip": ("skip", "dim")}
 
@@ -37,27 +41,31 @@ def list_(
 ) -> None:
     """List the installed tasks; a broken one with its reason."""
     with phase("libraries"):
-        from lidardesign.registry import list_tasks
+        from lidardesign.task import TASKS
 
-    entries = [
-        {"name": item.name, "summary": item.summary, "distribution": item.distribution, "error": item.error}
-        for item in list_tasks()
-    ]
-    output.result({"tasks": entries}, lambda rich: _show_list(entries, rich), show_costs=False)
+    list_plugins(TASKS, {"task": "name", "what it is": "summary", "from": "distribution"}, output)
 
 
-def _show_list(entries: list[dict[str, Any]], rich: RichConsole) -> None:
+def list_plugins(kind: PluginKind[Any], shown: Mapping[str, str], output: Output) -> None:
+    """Print all plugins of a kind; of a broken one its reason. A table shows some facts below headings."""
     from rich.text import Text
 
-    rows = [
-        (
-            item["name"],
-            Text.assemble(("broken:", "red"), f" {item['error']}") if item["error"] else item["summary"],
-            item["distribution"],
-        )
-        for item in entries
+    entries: list[dict[str, Any]] = [
+        {"name": one.name, "summary": "", **one.facts, "distribution": one.distribution, "error": one.error}
+        for one in kind.listings()
     ]
-    rich.print(text_table(("task", "what it is", "from"), rows))
+    rows = []
+    for one in entries:
+        summary = Text.assemble(("broken:", "red"), f" {one['error']}") if one["error"] else one["summary"]
+        rows.append([{**one, "summary": summary}.get(key, "") for key in shown.values()])
+    output.result({f"{kind.noun}s": entries}, lambda rich: rich.print(text_table([*shown], rows)), show_costs=False)
+
+
+def show_plugin(kind: PluginKind[Any], name: str, output: Output) -> None:
+    """Print what a plugin's contract says of it."""
+    facts = {"name": name, **kind.loaded(name)[1], "distribution": kind.distribution_of(name)}
+    rows = [(key, ", ".join(fact) if isinstance(fact, list) else str(fact)) for key, fact in facts.items()]
+    output.result(facts, lambda rich: rich.print(text_table(("", ""), rows)), show_costs=False)
 
 
 @tasks_app.command("show")
@@ -69,7 +77,7 @@ def show(
     """Show a task. It has a metric, a design space and keys of its configuration."""
     with phase("libraries"):
         from lidardesign.api.config_reference import describe_task
-        from lidardesign.registry import load_task
+        from lidardesign.task import load_task
 
     document = describe_task(load_task(name))
     output.result(document, lambda rich: _show_task(document, rich), show_costs=False)
@@ -126,31 +134,40 @@ def check(
 ) -> None:
     """Check that a task keeps the contract. Every law is tried; exit 6 where one does not hold."""
     with phase("libraries"):
-        from lidardesign.contract.contract import LAWS, refuse_broken
-        from lidardesign.contract.process import CheckRequest, check_in_process
+        from lidardesign.contract.process import CheckRequest
 
     choices = complete(CheckCommand, given)
-    request = CheckRequest(name, choices["config"], tuple(choices["settings"]), choices["seed"], choices["seconds"])
-    findings = []
+    try_laws(
+        CheckRequest(name, choices["config"], tuple(choices["settings"]), choices["seed"], choices["seconds"]), output
+    )
+
+
+def try_laws(request: CheckRequest, output: Output) -> None:
+    """Try a plugin's contract and print the findings.
+
+    Raises:
+        BrokenLawError: A law does not hold.
+    """
+    with phase("libraries"):
+        from lidardesign.contract.contract import refuse_broken
+        from lidardesign.contract.process import check_in_process, statements_of
+
+    findings, where = [], f"{request.noun} {request.name}"
     with output.progress("contract") as progress, phase("contract"):
         for finding in check_in_process(request):
             findings.append(finding)
-            progress.show(len(findings), len(LAWS) + 1, detail=finding.law)
+            progress.show(len(findings), len(statements_of(request.noun)), detail=finding.law)
     counts = {outcome: sum(finding.outcome == outcome for finding in findings) for outcome in OUTCOMES}
-    document = {
-        "task": name,
-        "keeps": not counts["fail"],
-        **counts,
-        "laws": [finding.as_dict() for finding in findings],
-    }
-    output.result(document, lambda rich: _show_laws(document, rich))
-    refuse_broken(name, findings)
+    laws = [finding.as_dict() for finding in findings]
+    document = {request.noun: request.name, "keeps": not counts["fail"], **counts, "laws": laws}
+    output.result(document, lambda rich: _show_laws(where, document, rich))
+    refuse_broken(where, findings)
 
 
-def _show_laws(document: Mapping[str, Any], rich: RichConsole) -> None:
+def _show_laws(title: str, document: Mapping[str, Any], rich: RichConsole) -> None:
     from rich.text import Text
 
-    table = text_table(("law", "", "what was found"), title=f"task {document['task']}")
+    table = text_table(("law", "", "what was found"), title=title)
     group = ""
     for law in document["laws"]:
         if group and law["group"] != group:

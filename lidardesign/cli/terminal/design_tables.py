@@ -169,7 +169,7 @@ def show_fit(
     if not verbose:
         _show_sensors(design, rich)
         _show_choice(design, rich)
-        mass = document["error_estimates"].get("admissible_mass")
+        mass = document.get("error_estimates", {}).get("admissible_mass")
         if mass is not None and mass["value"] < MOST_ADMISSIBLE:
             rich.print(f"the constraints leave {100 * mass['value']:.2g} % of the density")
         if checks:
@@ -178,9 +178,10 @@ def show_fit(
     show_design(design, rich)
     show_constraints(checks, rich)
     figures = {"log-likelihood": "log_likelihood", "ESS": "ess", "density inside the constraints": "admissible_mass"}
-    estimates = document["error_estimates"]
+    estimates = document.get("error_estimates", {})
     known = [f"{name} {with_error(estimates[key])}" for name, key in figures.items() if key in estimates]
-    known.append(f"{number(document['seconds'], 3)} s" + (" (+- are standard errors)" if known else ""))
+    if "seconds" in document:
+        known.append(f"{number(document['seconds'], 3)} s" + (" (+- are standard errors)" if known else ""))
     rich.print(", ".join(known))
 
 

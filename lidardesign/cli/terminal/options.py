@@ -27,16 +27,26 @@ MOST_SHOWN = 10**9  # larger limits of whole numbers mean nothing to people
 
 def tasks() -> list[str]:
     """Installed tasks; none of them is imported."""
+    return _plugins("lidardesign.tasks")
+
+
+def formats() -> list[str]:
+    """Installed formats of exports; none of them is imported."""
+    return _plugins("lidardesign.formats")
+
+
+def _plugins(group: str) -> list[str]:
     from importlib.metadata import entry_points
 
-    return sorted({entry.name for entry in entry_points(group="lidardesign.tasks")})
+    return sorted({entry.name for entry in entry_points(group=group)})
 
 
-def formats() -> list[tuple[str, str]]:
-    """Formats of exports with their summaries."""
-    from lidardesign.formats.registry import EXPORTERS
+def methods() -> list[str]:
+    """Layouts of `fit` and installed methods; none of them is imported."""
+    from lidardesign.choices.fit import LAYOUTS
+    from lidardesign.problem.method import METHODS
 
-    return [(name, exporter.summary) for name, exporter in EXPORTERS.items()]
+    return [*LAYOUTS, *METHODS.names()]
 
 
 def parts() -> list[str]:
@@ -52,7 +62,7 @@ def detectors() -> list[str]:
 def configuration_keys(context: typer.Context) -> list[tuple[str, str]]:
     """Keys of the configuration of the task that is on the command line."""
     from lidardesign.config import DensitySettings, LearningSettings
-    from lidardesign.registry import load_task
+    from lidardesign.task import load_task
 
     # typer leaves arguments in args while the last option waits for its value
     name = context.params.get("task") or context.params.get("name") or context.args[0]

@@ -22,7 +22,7 @@ from lidardesign.density.objective.quadrature import Quadrature
 from lidardesign.density.objective.target import Target, build_target
 from lidardesign.density.objective.visibility import Optics, RayBatch, Raycast
 from lidardesign.errors import BackgroundNote, ConfigError, DataError
-from lidardesign.registry import plugin_guard
+from lidardesign.plugins import plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.scenes.scene import Scene
 from lidardesign.space import RANGE, observed_point

@@ -44,7 +44,7 @@ from lidardesign.density.training.trainer import (
 )
 from lidardesign.errors import BackgroundNote, ConfigError, DataError
 from lidardesign.estimates import Estimate
-from lidardesign.registry import plugin_guard
+from lidardesign.plugins import plugin_guard
 from lidardesign.run.clock import peak_memory_bytes, phase, running
 from lidardesign.run.manifest import note, record
 from lidardesign.samples import Samples, Verdict, save_samples

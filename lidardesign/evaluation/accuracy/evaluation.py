@@ -15,14 +15,14 @@ import numpy as np
 
 from lidardesign.errors import ConfigError
 from lidardesign.estimates import mean_interval
-from lidardesign.run.clock import Progress, phase
-from lidardesign.scenes.casting import SceneCaster
-from lidardesign.scenes.rays import path_windows
-from lidardesign.scenes.scene import Scene
 from lidardesign.evaluation.accuracy import fields, training
 from lidardesign.evaluation.accuracy.probes import AccuracyRequest
 from lidardesign.evaluation.request import EvaluationRequest, numbers_fired
 from lidardesign.evaluation.results import Row
+from lidardesign.run.clock import Progress, phase
+from lidardesign.scenes.casting import SceneCaster
+from lidardesign.scenes.rays import path_windows
+from lidardesign.scenes.scene import Scene
 from lidardesign.scoring.fired import Positions, fired
 from lidardesign.scoring.scene_scores import score_lists
 from lidardesign.scoring.sweep import Accuracy, Measurement, Sweep, timed, with_memory

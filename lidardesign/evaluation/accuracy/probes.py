@@ -18,10 +18,10 @@ from lidardesign.density.training.learn import FLOW
 from lidardesign.density.training.learned import LearningSteps, load_flow
 from lidardesign.density.training.losses import Pool
 from lidardesign.density.training.quality import misplaced_share
-from lidardesign.run.manifest import read_manifest
-from lidardesign.scenes.scene import Scene
 from lidardesign.evaluation.request import EvaluationRequest
 from lidardesign.evaluation.results import Evaluation
+from lidardesign.run.manifest import read_manifest
+from lidardesign.scenes.scene import Scene
 from lidardesign.scoring.sweep import Measurement, Sweep
 from lidardesign.task import random_generator
 

@@ -15,11 +15,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from lidardesign.errors import ConfigError, DataError
+from lidardesign.evaluation.captures.capture import Capture
 from lidardesign.formats.galvo import degree_frame, middle_boresight_deg, scan_angles_deg, scan_directions
+from lidardesign.methods.fields import quasi_random_points
 from lidardesign.numerics import EPSILON
 from lidardesign.scenes.rays import Rays
-from lidardesign.methods.fields import quasi_random_points
-from lidardesign.evaluation.captures.capture import Capture
 from lidardesign.simulate.detector.physics import FWHM_PER_SIGMA, Estimator, chunks
 
 # A ray that starts further from the scanner than this was not captured: it sees other surfaces.

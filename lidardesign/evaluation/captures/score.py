@@ -16,13 +16,6 @@ from scipy.spatial import cKDTree
 
 from lidardesign.errors import DataError
 from lidardesign.estimates import Estimate, median_error, share_error
-from lidardesign.formats.galvo import degree_frame, middle_boresight_deg
-from lidardesign.numerics import circular_difference
-from lidardesign.run.arrays import csv_table
-from lidardesign.run.files import write_atomic
-from lidardesign.scenes.mesh_files import load_mesh
-from lidardesign.scenes.rays import Rays
-from lidardesign.scenes.scene import Body, Scene
 from lidardesign.evaluation.captures.capture import Capture
 from lidardesign.evaluation.captures.scan import (
     Captured,
@@ -33,6 +26,13 @@ from lidardesign.evaluation.captures.scan import (
     uniform_rays,
     whole_window,
 )
+from lidardesign.formats.galvo import degree_frame, middle_boresight_deg
+from lidardesign.numerics import circular_difference
+from lidardesign.run.arrays import csv_table
+from lidardesign.run.files import write_atomic
+from lidardesign.scenes.mesh_files import load_mesh
+from lidardesign.scenes.rays import Rays
+from lidardesign.scenes.scene import Body, Scene
 from lidardesign.scoring.metrics import (
     SurfaceCloud,
     delaunay_surface,

@@ -1,0 +1,222 @@
+"""Formats as plugins: the shipped ones keep their contract, and a broken one harms nothing else."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tomllib
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.command_line import files_under
+from support.exports import write_as
+from support.plugins import install_plugins
+from support.rigs import rig
+
+import lidardesign.formats
+from lidardesign.contract import contract_of_format
+from lidardesign.errors import DataError, PluginError
+from lidardesign.formats import FORMATS, Format, write_design
+from lidardesign.formats.designs import load_design
+from lidardesign.sensors.design_file import save_design
+
+ROOT = Path(__file__).parents[2]
+# A small whole format that keeps the contract and reads its own files; broken ones are made of it by replacing words.
+GOOD = """
+import numpy as np
+from lidardesign.formats.rig import Rig, RigSensor
+
+
+class Plugin:
+    name, suffix, summary = "NAME", ".NAME", "a line of numbers per ray"
+    reader, checked = "a script", "read by itself"
+    api_version, holds, is_folder = 1, frozenset({"rays"}), False
+
+    def write(self, design, rays, path, options):
+        columns = [rays.origin_m, rays.azimuth_rad[:, None], rays.elevation_rad[:, None], rays.gate_m]
+        table = np.hstack(columns)
+        path.write_text("".join(" ".join(map(repr, row)) + "\\n" for row in table.tolist()))
+        return ["sensors and times are lost"]
+
+    def read(self, path):
+        table = np.loadtxt(path, ndmin=2)
+        return Rig("NAME", [RigSensor("all", table[:, :3], table[:, 3], table[:, 4], table[:, 5:])], [], "")
+"""
+WRITE = "        columns = ["
+
+
+def test_the_shipped_formats_keep_the_contract(format_law):
+    format_law.check()
+
+
+def test_pyproject_names_every_shipped_format_and_nothing_else():
+    homes = {}
+    for path in Path(lidardesign.formats.__file__).parent.glob("*.py"):
+        name = f"lidardesign.formats.{path.stem}"
+        for key, value in vars(import_module(name)).items() if path.stem != "__init__" else ():
+            homes |= {value.name: f"{name}:{key}"} if isinstance(value, Format) else {}
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    assert settings["project"]["entry-points"]["lidardesign.formats"] == homes
+    assert sorted(settings["tool"]["pytest"]["ini_options"]["lidardesign_formats"]) == sorted(homes)
+    assert [name for name in FORMATS.names() if FORMATS.is_shipped(name)] == sorted(homes)
+
+
+def test_loading_a_format_imports_no_other_module_of_formats():
+    code = (
+        "import sys; from lidardesign.formats import FORMATS; FORMATS.load('csv'); "
+        "print(*(name for name in sys.modules if name.startswith('lidardesign.formats.')))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert set(done.stdout.split()) == {"lidardesign.formats.ray_lists", "lidardesign.formats.rig"}
+
+
+@pytest.fixture
+def install(tmp_path, monkeypatch):
+    """Install formats of another package by name."""
+    place = tmp_path / "installed"
+    monkeypatch.syspath_prepend(place)
+    yield lambda sources: install_plugins(place, sources, module="hard_formats", group="lidardesign.formats")
+    for name in [name for name in sys.modules if name.startswith("hard_formats")]:
+        del sys.modules[name]
+
+
+@pytest.fixture
+def design(tmp_path):
+    """A design file that fires rays of its own."""
+    path = tmp_path / "rig.yaml"
+    save_design(rig()[0], path)
+    return path
+
+
+def test_a_format_of_another_package_is_listed_written_read_and_checked(install, design, lidardesign, tmp_path):
+    install({"points": GOOD, "other": "raise RuntimeError('no licence')"})
+    listed = {entry["name"]: entry for entry in lidardesign("formats", "list", "--json").json["formats"]}
+    assert listed["points"]["suffix"] == ".points"
+    assert listed["points"]["distribution"] == "plugins 1.0"
+    assert "no licence" in listed["other"]["error"]
+    assert listed["csv"]["error"] is None
+    assert lidardesign("export", "--list", "--json").json["formats"] == [*listed.values()]
+    assert lidardesign("export", design, "--format", "points").code == 0
+    assert "hard_formats_other" not in sys.modules
+    found, expected = load_design(tmp_path / "rig.points").rays(), load_design(design).rays()
+    for name in ("origin_m", "direction", "gate_m"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-12)
+    checked = lidardesign("formats", "check", "points", "--json")
+    assert checked.code == 0, checked.err
+    assert checked.json["format"] == "points"
+    assert {law["outcome"] for law in checked.json["laws"]} == {"pass"}
+    assert "points" in lidardesign("formats", "show", "points").out
+
+
+# What is broken when it is used or imported: words that are replaced, and what is said of it.
+BROKEN = {
+    "raises": (WRITE, "        1 / 0\n" + WRITE, "ZeroDivisionError"),
+    "stops": (WRITE, "        path.write_text('half')\n        raise RuntimeError('half-way')\n" + WRITE, "half-way"),
+    "writes_nothing": ("        path.write_text(", "        str(", "wrote no file"),
+    "is_a_folder": ("False", "True", "wrote no folder"),
+    "says_no_notes": ("return [", "return None and [", "TypeError"),
+    "leaves": (WRITE, "        raise SystemExit(3)\n" + WRITE, "exit 3"),
+    "crashes": (GOOD, "import ctypes\nctypes.string_at(0)", "crashes while it is imported"),
+    "is_of_another_version": ("is_folder = 1,", "is_folder = 7,", "version 7 of the format interface"),
+    "holds_everything": ('{"rays"}', '{"rays", "colour"}', "holds colour"),
+    "has_no_dot": ('".NAME"', '"NAME"', "its suffix is 'has_no_dot'"),
+    "has_no_write": ("def write(", "def writes(", "no method write()"),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_a_broken_format_exits_6_and_leaves_what_was_there(install, design, lidardesign, tmp_path, name):
+    old, new, words = BROKEN[name]
+    assert old in GOOD
+    install({name: GOOD.replace(old, new)})
+    out = tmp_path / "out"
+    out.mkdir() if name == "is_a_folder" else out.write_text("mine", encoding="utf-8")
+    before = files_under(tmp_path)
+    result = lidardesign("export", design, "--format", name, "--out", "out", "--json")
+    assert result.code == 6, result.err
+    assert words in result.err
+    assert result.json["error"]["where"] == f"format {name}"
+    assert files_under(tmp_path) == before
+    assert lidardesign("export", design, "--format", "csv").code == 0
+
+
+def test_a_file_is_never_written_over_a_folder_nor_a_folder_over_a_file(install, tmp_path):
+    folder = '        path.mkdir()\n        (path / "a").write_text("a")\n        return []\n'
+    install({"one": GOOD, "many": GOOD.replace("False", "True").replace(WRITE, folder + WRITE)})
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "file").write_text("mine", encoding="utf-8")
+    for name, taken in (("one", "folder"), ("many", "file")):
+        with pytest.raises(DataError, match=taken):
+            write_as(name, *rig(), tmp_path / taken)
+    assert (tmp_path / "file").read_text(encoding="utf-8") == "mine"
+    write_as("many", *rig(), tmp_path / "new")
+    assert (tmp_path / "new" / "a").read_text(encoding="utf-8") == "a"
+
+
+def test_a_foreign_reader_is_asked_only_for_what_no_shipped_one_knows_and_contained(install, tmp_path):
+    install({"sdf2": GOOD.replace("np.loadtxt(path, ndmin=2)", "1 / 0"), "xml": "1 / 0"})
+    for path in (tmp_path / "rig.sdf2", tmp_path / "rig.xml"):
+        path.write_text("<mujoco/>", encoding="utf-8")
+    with pytest.raises(PluginError, match="ZeroDivisionError"):
+        load_design(tmp_path / "rig.sdf2")
+    with pytest.raises(DataError, match="has no rangefinder"):
+        load_design(tmp_path / "rig.xml")
+    assert "hard_formats_xml" not in sys.modules
+
+
+# What a format is changed into, by the law that it then breaks: words that are replaced, and what is said of it.
+TWICE = "        self.n = getattr(self, 'n', 0) + 1\n        path.write_text(str(self.n))\n        return []\n"
+HALF = "        path.write_text('')\n        [design.sensors[one] for one in rays.sensor]\n"
+LAWLESS = {
+    "designs are written": [
+        (WRITE, TWICE + WRITE, "other bytes or notes the second time"),
+        (WRITE, "        rays.gate_m[:] = 1.0\n" + WRITE, "writing changed the design"),
+        (WRITE, "        (path.parent / 'more').touch()\n" + WRITE, "design.points, more"),
+        (WRITE, "        raise ValueError('never')\n" + WRITE, "write failed: ValueError: never"),
+        ('return ["sensors and times are lost"]', 'return ("lost",)', "a list of notes"),
+    ],
+    "says what it holds": [
+        ('{"rays"}', '{"rays", "rate"}', "says that it holds rate, but writes the same without"),
+        ('{"rays"}', '{"rays", "adaptive"}', "says that it holds adaptive"),
+    ],
+    "files are whole": [
+        (WRITE, HALF + WRITE, "half-written"),
+        (WRITE, "        import shutil\n        shutil.rmtree(path, ignore_errors=True)\n" + WRITE, "in its place"),
+    ],
+    "rays come back": [
+        ("table[:, 4], table", "table[:, 4] / 2, 2 + table", "direction, gate_m came back changed, and 1 notes"),
+        ("np.loadtxt(path, ndmin=2)", "np.loadtxt(path, ndmin=2)[:1]", "1 rays were read of 6"),
+    ],
+    "no global random state": [(WRITE, "        np.random.uniform()\n" + WRITE, "numpy's random in write")],
+}
+
+
+@pytest.mark.parametrize("law", LAWLESS)
+def test_a_law_names_what_is_wrong(law):
+    for old, new, words in LAWLESS[law]:
+        assert old in GOOD
+        namespace: dict = {}
+        exec(GOOD.replace(old, new).replace("NAME", "points"), namespace)
+        finding = contract_of_format(namespace["Plugin"]()).finding(law)
+        assert finding.outcome == "fail", (law, new)
+        assert words in finding.detail
+
+
+def test_a_format_that_is_not_installed_is_contained_too(tmp_path):
+    def write(design, rays, path, options):
+        path.write_text("half", encoding="utf-8")
+        raise RuntimeError("half-way")
+
+    form = Format("mine", ".mine", "mine", write, "me", "not at all")
+    with pytest.raises(PluginError, match="half-way"):
+        write_design(form, *rig(), tmp_path / "out")
+    assert not list(tmp_path.iterdir())
+
+
+def test_metadata_of_before_there_were_formats_says_what_to_do(monkeypatch, lidardesign, design):
+    monkeypatch.setattr(type(FORMATS), "_offers", lambda self: {})
+    result = lidardesign("export", design, "--format", "csv")
+    assert result.code == 2
+    assert "install lidardesign again" in result.err
