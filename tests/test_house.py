@@ -15,7 +15,7 @@ TASKS = ROOT / "tasks" / "lidardesign_tasks"
 MOST_MODULES = 14
 MOST_PARAMETERS = 12
 # Of the whole program: one person owns it.
-MOST_STATEMENTS, MOST_MODULES_IN_ALL, MOST_COMMAND_PARAMETERS, MOST_CLI_LINES = 29_740, 242, 188, 3_827
+MOST_STATEMENTS, MOST_MODULES_IN_ALL, MOST_COMMAND_PARAMETERS, MOST_CLI_LINES = 29_740, 242, 188, 3_818
 # Functions that take what commands take, each choice by its name.
 API = {"constrain", "evaluate", "evaluate_seeds", "fit", "learn"}
 

@@ -72,12 +72,7 @@ def export(
         if list_formats:
             return _list(output)
         with phase("libraries"):
-            from lidardesign.api.export import (
-                DesignSource,
-                ExportRequest,
-                export_target,
-                format_of,
-            )
+            from lidardesign.api.export import DesignSource, ExportRequest, export_target, format_of
             from lidardesign.formats.designs import read_design
 
         place = options.parse_at(at)
