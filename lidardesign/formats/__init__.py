@@ -8,6 +8,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -130,10 +131,8 @@ def write_design(
     if robot is not None and ROBOT not in format.holds:
         raise ConfigError(f"{format.name} cannot hold a robot", where="--robot", allowed=_holding(ROBOT))
     options = WriteOptions(DEFAULT_RATE_HZ if rate_hz is None else rate_hz, robot)
-    if FORMATS.is_shipped(format.name):
-        notes = format.write(design, rays, Path(path), options)
-    else:
-        notes = _write_contained(format, design, rays, Path(path), options)
+    write = format.write if FORMATS.is_shipped(format.name) else partial(_write_contained, format)
+    notes = write(design, rays, Path(path), options)
     if design.constraints:
         notes.append("the constraints of the design are lost")
     if design.mount is not None and robot is None:
@@ -149,8 +148,8 @@ def _write_contained(format: Format, design: DesignSpec, rays: Rays, path: Path,
         with plugin_guard(format.name, "format"):
             notes = [str(note) for note in format.write(design, rays, staged, options)]
         if not (staged.is_dir() if format.is_folder else staged.is_file()):
-            what = "folder" if format.is_folder else "file"
-            raise PluginError(f"wrote no {what}", where=f"format {format.name}", hint=AUTHOR_HINT)
+            found = f"wrote no {'folder' if format.is_folder else 'file'}"
+            raise PluginError(found, where=f"format {format.name}", hint=AUTHOR_HINT)
         if format.is_folder:
             files = [file for file in sorted(staged.rglob("*")) if file.is_file()]
             contents = {file.relative_to(staged).as_posix(): file.read_bytes() for file in files}

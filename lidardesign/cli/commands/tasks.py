@@ -143,11 +143,7 @@ def check(
 
 
 def try_laws(request: CheckRequest, output: Output) -> None:
-    """Try a plugin's contract and print the findings.
-
-    Raises:
-        BrokenLawError: A law does not hold.
-    """
+    """Try a plugin's contract and print the findings; raises BrokenLawError where a law does not hold."""
     with phase("libraries"):
         from lidardesign.contract.contract import refuse_broken
         from lidardesign.contract.process import check_in_process, statements_of
