@@ -6,7 +6,7 @@ As many rays, positions and frames are kept as a page can hold; `SceneFigure` ha
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -21,7 +21,7 @@ from lidardesign.scenes.scene import Body, Box, Mesh, Plane, Round, Scene
 from lidardesign.scenes.surface import BOX_CORNERS, BOX_QUADS, grid_faces, round_triangles
 from lidardesign.scoring.evaluation.request import EvaluationRequest, numbers_fired
 from lidardesign.scoring.evaluation.results import Evaluation
-from lidardesign.scoring.fired import fired
+from lidardesign.scoring.fired import Positions, fired
 from lidardesign.sensors.adaptive import AdaptiveRays
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import design_document
@@ -106,7 +106,7 @@ def scene_figure(
     scene: Scene,
     designs: Sequence[DesignSpec],
     places: Sequence[Conditions],
-    laid_out: Callable[[DesignSpec, Conditions], Rays],
+    positions: Sequence[Positions],
     *,
     planner: Planner | None = None,
     seed: int = 0,
@@ -117,12 +117,13 @@ def scene_figure(
         scene: The scene.
         designs: The designs.
         places: The condition values that they are evaluated at, ascending.
-        laid_out: A design's rays at a condition value, equal numbers at each.
+        positions: The rays of each design at these, equal numbers at each; the last go on where there are fewer.
         planner: How effects are chosen; None: geometry alone.
         seed: Of the effects' random numbers.
     """
-    chosen = tuple(places[index] for index in _spread(len(places), MOST_STEPS))
-    every = [[laid_out(design, at) for at in chosen] for design in designs]
+    steps = _spread(len(places), MOST_STEPS)
+    chosen = tuple(places[index] for index in steps)
+    every = [[lists[min(index, len(lists) - 1)] for index in steps] for lists in positions]
     # as many frames, and as many rays of each placed design, as can be drawn
     count = max(len(designs) * len(chosen), 1)
     frames = _spread(scene.frames, min(MOST_STEPS, max(5, MOST_RAY_STEPS // (count * FEWEST_RAYS))))
@@ -178,23 +179,18 @@ def _first_hits(rays: Sequence[Rays], casters: Sequence[SceneCaster]) -> tuple[n
 
 def evaluated_scene(evaluation: Evaluation, request: EvaluationRequest) -> SceneFigure:
     """An evaluation's designs in its first held-out scene, with the effects that the scenes call for."""
-
-    def number(design: DesignSpec) -> int:
-        return design.count or max(numbers_fired(design, request.rays, request.alone))
-
-    def laid_out(design: DesignSpec, at: Conditions) -> Rays:
-        lists = every[design.name]
-        return lists[min(places.index(at), len(lists) - 1)]
-
     places: Sequence[Conditions] = sorted(request.conditions, key=lambda condition: tuple(condition.values()))
-    how = places, request.planner, request.task
-    every = {design.name: fired(design, number(design), *how) for design in request.designs}
-    following = {name: lists for name, lists in every.items() if isinstance(lists, AdaptiveRays)}
+    positions = {}
+    for design in request.designs:
+        count = design.count or max(numbers_fired(design, request.rays, request.alone))
+        positions[design.name] = fired(design, count, places, request.planner, request.task)
+    following = {name: lists for name, lists in positions.items() if isinstance(lists, AdaptiveRays)}
     planner = request.planner if any(effect.on for effect in evaluation.effects) else None
     if following:
         places = [{PATTERN: pattern} for pattern in range(max(map(len, following.values())))]
     scene = request.test[0]
-    found = scene_figure(scene, request.designs, places, laid_out, planner=planner, seed=request.seed)
+    shown = [*positions.values()]
+    found = scene_figure(scene, request.designs, places, shown, planner=planner, seed=request.seed)
     return replace(found, fired={name: _fired(scene, one, planner, request.seed) for name, one in following.items()})
 
 
