@@ -82,11 +82,8 @@ def make_shown(name="plain", designs=2, places=PLACES, rays=25, scene=None, **fu
     for number in range(designs):
         sensors = (make_sensor(f"a {name}", 0.2), make_sensor(f"b {name}", -0.2, 0.1))
         made.append(DesignSpec(name if number == 0 else f"{name} {number}", sensors))
-
-    def laid_out(design, at):
-        return moved_to(make_rays(rays, 2, lift=0.05), at)
-
-    return scene_figure(scene or make_scene(name), made, places, laid_out, **further)
+    fired = tuple(moved_to(make_rays(rays, 2, lift=0.05), at) for at in places)
+    return scene_figure(scene or make_scene(name), made, places, designs * [fired], **further)
 
 
 def make_samples(count=4000):
