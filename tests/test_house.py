@@ -80,10 +80,16 @@ def package() -> dict[str, ast.Module]:
     return {name: tree for name, tree in trees().items() if name.startswith("lidardesign") and "_tasks" not in name}
 
 
+@cache
+def nodes_of(tree: ast.AST) -> tuple[ast.AST, ...]:
+    return tuple(ast.walk(tree))
+
+
+@cache
 def imported(tree: ast.AST) -> list[tuple[str, int]]:
     """Every imported module with its line; `from a import b` counts as a.b where that is a module."""
     names = []
-    for node in ast.walk(tree):
+    for node in nodes_of(tree):
         if isinstance(node, ast.Import):
             names += [(alias.name, node.lineno) for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
@@ -178,7 +184,7 @@ def test_functions_outside_commands_take_few_parameters():
     for name, tree in package().items():
         if name.startswith("lidardesign.cli.commands."):
             continue
-        for node in ast.walk(tree):
+        for node in nodes_of(tree):
             if isinstance(node, ast.FunctionDef) and node.name not in API:
                 arguments = node.args
                 count = len(arguments.posonlyargs + arguments.args + arguments.kwonlyargs)
@@ -230,7 +236,7 @@ def test_nothing_imports_the_shipped_tasks():
 def test_exported_names_exist():
     missing = []
     for name, tree in package().items():
-        if any(isinstance(node, ast.Name) and node.id == "__all__" for node in ast.walk(tree)):
+        if any(isinstance(node, ast.Name) and node.id == "__all__" for node in nodes_of(tree)):
             module = importlib.import_module(name)
             missing += [f"{name}.{export}" for export in module.__all__ if not hasattr(module, export)]
     assert not missing
@@ -256,7 +262,7 @@ def taken_by(node: ast.FunctionDef | ast.ClassDef) -> set[str]:
 def test_docstrings_describe_all_that_functions_take_and_nothing_else():
     wrong = {}
     for name, tree in trees().items():
-        for node in ast.walk(tree):
+        for node in nodes_of(tree):
             if isinstance(node, ast.FunctionDef | ast.ClassDef) and described(node):
                 apart = described(node) ^ taken_by(node)
                 # fields of a base are described where it is, and some fields only there
@@ -288,14 +294,13 @@ def test_every_public_function_is_used_by_the_program():
             words.update(set(re.findall(r"\w+", path.read_text(encoding="utf-8"))))
     lonely = []
     for name, tree in package().items():
-        text = ast.unparse(tree)
         for node in tree.body:
             # pytest calls its hooks by their names
             hidden = isinstance(node, ast.FunctionDef) and node.name.startswith(("_", "pytest_"))
-            if isinstance(node, ast.FunctionDef) and not hidden and not node.decorator_list:
-                uses = len(re.findall(rf"\b{node.name}\b", text))
-                if words[node.name] == 1 and uses == 1:
-                    lonely.append(f"{name}.{node.name}")
+            is_plain = isinstance(node, ast.FunctionDef) and not hidden and not node.decorator_list
+            if is_plain and words[node.name] == 1:
+                uses = len(re.findall(rf"\b{node.name}\b", ast.unparse(tree)))
+                lonely += [f"{name}.{node.name}"] if uses == 1 else []
     assert not lonely
 
 
@@ -333,10 +338,12 @@ def test_no_epsilon_stands_outside_numerics():
 def test_no_test_imports_another_test():
     """What tests share is in tests/support, so that a test can be read, moved and dropped by itself."""
     folder = ROOT / "tests"
+    texts = {path: path.read_text(encoding="utf-8") for path in folder.rglob("*.py")}
     imports = [
         f"{path.relative_to(folder)}: {node.module}"
-        for path in folder.rglob("*.py")
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        for path, text in texts.items()
+        if re.search(r"\bfrom\s\S*test_", text)  # parsing takes longest
+        for node in ast.walk(ast.parse(text))
         if isinstance(node, ast.ImportFrom) and (node.module or "").rpartition(".")[2].startswith("test_")
     ]
     assert not imports
@@ -345,12 +352,12 @@ def test_no_test_imports_another_test():
 def statements_of(tree: ast.Module) -> int:
     """Statements without docstrings."""
     documented = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
-    docstrings = sum(isinstance(node, documented) and ast.get_docstring(node) is not None for node in ast.walk(tree))
-    return sum(isinstance(node, ast.stmt) for node in ast.walk(tree)) - docstrings
+    docstrings = sum(isinstance(node, documented) and ast.get_docstring(node) is not None for node in nodes_of(tree))
+    return sum(isinstance(node, ast.stmt) for node in nodes_of(tree)) - docstrings
 
 
 def test_the_program_stays_within_its_size():
-    functions = [node for tree in package().values() for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+    functions = [node for tree in package().values() for node in nodes_of(tree) if isinstance(node, ast.FunctionDef)]
     annotations = [ast.unparse(one.annotation) for node in functions for one in node.args.args if one.annotation]
     assert sum(map(statements_of, package().values())) <= MOST_STATEMENTS
     assert len(package()) <= MOST_MODULES_IN_ALL
