@@ -84,7 +84,7 @@ def curves(run: Any, samples: Callable[[], Any], kind: str, counts: Sequence[int
     """Of designs fitted with a seed, and of their twins, which are fitted to other samples."""
     from lidardesign.evaluation.request import EvaluationRequest
     from lidardesign.evaluation.score import evaluate
-    from lidardesign.fitting.fit import TWIN_NAME, twin_without_visibility
+    from lidardesign.methods.no_visibility import TWIN_NAME, twin_without_visibility
 
     started, rows = time.perf_counter(), []
     config, name = run.config, f"benchmark-{kind}"
@@ -169,7 +169,7 @@ def main() -> None:
     tried = sorted({*options.rays, *options.further_rays})
     rows, lines = [], []
     from lidardesign import open_run
-    from lidardesign.fitting.fit import twin_samples
+    from lidardesign.methods.no_visibility import twin_samples
 
     with tempfile.TemporaryDirectory() as folder:
         run = open_run(learned("arm", Path(folder), options, settings))

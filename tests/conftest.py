@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import typer
 from hypothesis import HealthCheck, settings
+from lidardesign_tasks import flatland
 
 settings.register_profile("dev", max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.register_profile("ci", max_examples=100, deadline=None, derandomize=True, print_blob=True)
@@ -52,13 +53,16 @@ def pytest_terminal_summary(terminalreporter):
         terminalreporter.write_line(f"{count} skipped: {reason}")
 
 
-# Numbers of scenes, and numbers of sensors that are tried, with the modules that read them.
-SMALL = {
-    "FEW_SCENES": (5, "rays.information rays.training_scenes rays.selection fitting.chosen fitting.trials"),
-    "MOST_SCENES": (10, "rays.information rays.selection fitting.trials"),
-    "USUAL_SCENES": (10, "evaluation.entries"),
-    "COUNTS": ((1, 2), "fitting.fit"),
-}
+# Numbers of scenes, and of sensors, poses and sets that are tried, with the modules that read them.
+SMALL = (
+    ("FEW_SCENES", 5, "rays.information rays.training_scenes rays.selection fitting.chosen fitting.trials"),
+    ("MOST_SCENES", 10, "rays.information rays.selection fitting.trials"),
+    ("MOST_SCENES", 60, "rays.adaptive"),
+    ("USUAL_SCENES", 10, "methods.greedy"),
+    ("COUNTS", (1, 2), "fitting.fit"),
+    ("MOST_POSES", 60, "fitting.part_design"),
+    ("MOST_JUDGED", 3, "fitting.part_design"),
+)
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -69,10 +73,25 @@ def work_is_shortened():
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(typer.main, "get_command", functools.cache(typer.main.get_command))
-        for name, (number, modules) in SMALL.items():
+        for name, number, modules in SMALL:
             for module in modules.split():
                 patch.setattr(f"lidardesign.{module}.{name}", number)
+        patch.setattr(flatland, "visible_outline", kept_outlines(flatland.visible_outline))
         yield
+
+
+def kept_outlines(visible_outline):
+    """What flatland finds visible, found once of the same shapes at the same places from the same space."""
+    known = {}
+
+    def found(scene, space):
+        shapes = tuple((body.shape, body.is_target, body.pose().tobytes()) for body in scene.bodies)
+        key = shapes, (*space.low, *space.high)
+        if key not in known:
+            known[key] = visible_outline(scene, space)
+        return known[key].copy()
+
+    return found
 
 
 def _torch_state() -> tuple[object, ...] | None:

@@ -65,7 +65,7 @@ class MethodRequest:
                 )
         if DESIGN in method.needs or method.is_redrawn:
             fault = "draws other rays in every scene" if method.is_redrawn else "begins with a design"
-            raise ConfigError(f"it {fault}", where=where, allowed=", ".join(fixed_methods()))
+            raise ConfigError(f"it {fault}", where=where, hint="lidardesign methods list")
         numbers = sorted(run.task.defaults.rays)
         seed = run.config.seed if choices["seed"] is None else choices["seed"]
         config, training = run.config, TrainingScenes(run, seed)
@@ -120,9 +120,3 @@ def problem_of(
     if method is None or method in LAYOUTS:
         return FitRequest.resolve(run, {**given, "layout": layout or method, "method": None}, base, notes=notes)
     return MethodRequest.resolve(run, given, notes)
-
-
-def fixed_methods() -> list[str]:
-    """The names of methods that make a design of their own, the same for every scene."""
-    working = [one for one in METHODS.listings() if one.error is None]
-    return [one.name for one in working if DESIGN not in one.facts["needs"] and not one.facts["redrawn"]]

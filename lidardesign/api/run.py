@@ -17,6 +17,7 @@ from lidardesign.choices.learn import LearnChoices
 from lidardesign.errors import DataError, LidardesignError, names_arguments, pasted
 from lidardesign.fitting.options import DesignChoices
 from lidardesign.formats.designs import folder_of, reach_of, read_design
+from lidardesign.problem.method import DESIGN, METHODS
 from lidardesign.run.clock import Progress
 from lidardesign.run.files import writer
 from lidardesign.run.manifest import DAMAGED_HINT, read_manifest
@@ -326,3 +327,9 @@ def load_design(path: Path | str, run: Run | None = None, notes: Notes = log_not
         except LidardesignError as error:
             notes(f"the run of {path} cannot be opened: {error}")
     return Design(specification, run, path)
+
+
+def fixed_methods() -> list[str]:
+    """The names of methods that make a design of their own, the same for every scene."""
+    working = [one for one in METHODS.listings() if one.error is None]
+    return [one.name for one in working if DESIGN not in one.facts["needs"] and not one.facts["redrawn"]]

@@ -30,8 +30,8 @@ from lidardesign.evaluation.request import (
 )
 from lidardesign.evaluation.results import Evaluation, Paired, Row, write_csv
 from lidardesign.evaluation.score import evaluate as score_designs
-from lidardesign.fitting.fit import twin_samples, twin_without_visibility
 from lidardesign.methods.cma import CMA, DEFAULT_SECONDS, CmaSettings
+from lidardesign.methods.no_visibility import twin_samples, twin_without_visibility
 from lidardesign.problem.method import METHODS
 from lidardesign.rays.training_scenes import TrainingScenes
 from lidardesign.run.clock import Progress, outermost_clock, phase, running

@@ -4,16 +4,13 @@ Where the number of sensors is open, designs of several numbers are fitted at th
 training scenes that were held back, each in the bandwidth that it takes. The fewest sensors within a standard error of
 the best are taken, where bandwidth has the price that it has for rays. For a goal the least that keeps it is found in
 the same way, and fitted again as if it had been asked for.
-
-A design's twin is fitted to the density without its occlusion term, without learning again: the baseline
-`no-visibility`.
 """
 
 from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 from shlex import join
@@ -28,7 +25,7 @@ from lidardesign.constraints.feasibility import check_feasible
 from lidardesign.constraints.origins import placement_notes
 from lidardesign.errors import BackgroundNote, DataError, InfeasibleError
 from lidardesign.fitting.options import BEST
-from lidardesign.fitting.request import COUNTS, KEY, WORLD, FitRequest, RunTarget, Weighting, check_several
+from lidardesign.fitting.request import COUNTS, KEY, WORLD, FitRequest, RunTarget, check_several
 from lidardesign.fitting.result import FitResult
 from lidardesign.formats.designs import relative_folder
 from lidardesign.mixture.fit import FitProblem, FittedSensors, fit_sensors
@@ -40,7 +37,7 @@ from lidardesign.rays.training_scenes import CHOICE, TrainingScenes
 from lidardesign.run.clock import phase
 from lidardesign.run.manifest import read_manifest, versions
 from lidardesign.run.yaml import dump_yaml, merged, parse_yaml
-from lidardesign.run_folder import Notes, RunFolder, ignore, log_note
+from lidardesign.run_folder import Notes, ignore, log_note
 from lidardesign.samples import Samples, load_samples
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import design_document, digested
@@ -56,9 +53,6 @@ if TYPE_CHECKING:
 MOST_SILENT = 0.5
 # So much of what sensors see is seen by several, or a note says so where a sensor may fail.
 LEAST_SHARED = 0.9
-# As many samples as the standard preset of `learn` leaves.
-TWIN_SAMPLES = 100_000
-TWIN_NAME = "no-visibility"
 
 
 def fit_design(
@@ -464,81 +458,3 @@ class Fitter:
         from lidardesign.fitting.part_design import choose_parts
 
         return choose_parts(self.samples, request, self.training, notes, self.progress)
-
-
-def twin_samples(run: RunFolder) -> Samples:
-    """Samples of a run's density without its occlusion term.
-
-    Raises:
-        DataError: No ray of the design space comes near a target.
-    """
-    from lidardesign.density.objective.proposals import samples_without_visibility
-
-    config = run.config
-    samples = samples_without_visibility(
-        run.scenes("train", config.seed),
-        config.space,
-        config.density,
-        TWIN_SAMPLES,
-        random_generator(config.seed, "no visibility"),
-    )
-    if not len(samples):
-        raise DataError("no ray of the design space comes near a target")
-    return samples
-
-
-def twin_without_visibility(
-    design: DesignSpec,
-    run: RunFolder,
-    rays: int,
-    bandwidth_mbps: float | None = None,
-    samples: Callable[[], Samples] | None = None,
-) -> DesignSpec:
-    """A design fitted to the density without its occlusion term as a given one was to its own; it is not weighted.
-
-    Arguments:
-        design: The design whose number of sensors, layout, constraints, level, gates and seed are taken.
-        run: The run that judges.
-        rays: Rays per frame.
-        bandwidth_mbps: Its largest bandwidth, by the read-out model of evaluations; None: that of the design's
-            constraints, by their model.
-        samples: The samples, which several twins may share; None draws them.
-
-    Raises:
-        DataError: No ray of the design space comes near a target, or too few for so many sensors.
-        InfeasibleError: The twin cannot keep the design's constraints.
-    """
-    seed = design.provenance.get("seed")
-    seed = seed if isinstance(seed, int) else 0
-    document = {key: value for key, value in design.constraints.items() if key != "parts"}
-    if rays == 1:
-        document.pop("survive", None)
-    # a bandwidth is one of evaluations, whatever bits the design was made for
-    budget = document.get("budget", {}) if bandwidth_mbps is None else {"bandwidth_mbps": bandwidth_mbps}
-    document["budget"] = {**budget, "rays": rays}
-    # the rays of real parts and rings are what they are: sensors like those have even rays
-    layout = design.layout if design.layout in ("chosen", "even") else "even"
-    request = FitRequest(
-        run=run,
-        name=TWIN_NAME,
-        seed=seed,
-        constraints=Constraints.from_mapping(document, where=f"constraints of {design.name}"),
-        is_constrained=True,
-        at=design.at,
-        sensors=min(len(design.sensors), rays),
-        layout=layout,
-        rays=rays,
-        gates="ray" if design.has_gates_per_ray and layout == "chosen" else "sensor",
-        level=design.level,
-        weighting=Weighting(),
-        channels=None,
-        names=(),
-        certify=False,
-    )
-    target = RunTarget(run, visibility="off")
-    try:
-        drawn = twin_samples(run) if samples is None else samples()
-        return fit_design(request, notes=ignore, samples=drawn, target=target).design
-    except (DataError, InfeasibleError) as error:
-        error.where, error.hint = f"--baseline {TWIN_NAME}", "evaluate without it"
-        raise

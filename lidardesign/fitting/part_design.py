@@ -15,7 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from time import perf_counter
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -48,9 +48,7 @@ from lidardesign.rays.training_scenes import CHOICE, HELD_BACK, InformedScene, T
 from lidardesign.run.clock import phase
 from lidardesign.samples import Samples
 from lidardesign.scenes.rays import Rays
-from lidardesign.scenes.scene import Scene
 from lidardesign.scoring.fired import fired
-from lidardesign.scoring.scene_scores import TrainingScorer
 from lidardesign.sensors.bandwidth import split_budget
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import MOST_FILE_RAYS
@@ -66,6 +64,7 @@ JUDGED_FRAMES = 2000  # that the last sets are scored in at most, or twice as ma
 MOST_POSES = 500  # of each kind of part, over all places
 MOST_PLACES = 25  # in a box of origins
 MOST_TOLD = 1_000_000  # candidates times scenes
+Found = TypeVar("Found")
 
 
 @dataclass(eq=False)
@@ -143,7 +142,7 @@ def choose_parts(
 
     numbers, judged = range(request.fewest or count, count + 1), MOST_JUDGED * (1 if planner is None else 2)
     by_number = _sets_by_number(numbers, coverage, limits, chosen, judged, trial)
-    found = _judge_sets(by_number, held_back_scorer(training, planner), request, notes, progress)
+    found = _judge_sets(by_number, training, request, notes, progress)
     rows = [_row(one, placed) for one in found] if request.fewest else []
     for row in rows:
         notes(_row_text(row, request.run.metric))
@@ -277,7 +276,7 @@ def _covered(placed: list[PlacedPart], detector: Detector, notes: Callable[[str]
     return kept
 
 
-def _timed(scenes: Iterable[Scene], count: int, label: str, progress: Callable[[str], None]) -> Iterator[Scene]:
+def _timed(scenes: Iterable[Found], count: int, label: str, progress: Callable[[str], None]) -> Iterator[Found]:
     """Scenes as they come, with the time left for so many of them in a label."""
     began = perf_counter()
     for number, scene in enumerate(itertools.islice(scenes, count)):
@@ -324,13 +323,14 @@ def _enough_scenes(
 
 def _judge_sets(
     by_number: Sequence[list[SetTrial]],
-    scorer: TrainingScorer,
+    training: TrainingScenes,
     request: FitRequest,
     notes: Callable[[str], None],
     progress: Callable[[str], None],
 ) -> list[SetTrial]:
     """The best set of each number of parts by the task's score on training scenes that were held back."""
     trials, metric = [one for sets in by_number for one in sets], request.run.metric
+    scorer = held_back_scorer(training, request.planner)
     if len(trials) == 1 and scorer.planner is None and not request.fewest:
         return trials
     few = max(information.FEW_SCENES // 4, 1)

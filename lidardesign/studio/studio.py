@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 
 from lidardesign.api.design import Design
-from lidardesign.api.problems import fixed_methods
-from lidardesign.api.run import Run
+from lidardesign.api.run import Run, fixed_methods
 from lidardesign.api.scores import Scores
 from lidardesign.clouds.seen import Measuring, SeenScene
 from lidardesign.constraints.origins import SAME_PLACE_M, place_text

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rich.console import Console
+from support.command_line import FEW_SCENES
 
 import lidardesign as package
 from lidardesign import __version__
@@ -206,7 +207,7 @@ def test_a_pinned_origin_is_weighted_with_the_visibility_that_the_run_decided_on
         note(flat, visibility=decided)
     target = RunTarget(open_run(flat))
     assert [target(np.zeros((3, 6))).shape for _ in range(2)] == [(3,), (3,)]
-    assert asked == [(20, decided)]
+    assert asked == [(FEW_SCENES["train"], decided)]
 
 
 @pytest.mark.parametrize(("signal", "code"), [(KeyboardInterrupt, 130), (TerminatedError, 143)])

@@ -16,8 +16,9 @@ from lidardesign.constraints.document import Constraints
 from lidardesign.density.objective.proposals import samples_without_visibility
 from lidardesign.errors import DataError, InfeasibleError
 from lidardesign.fitting import fit as fit_module
-from lidardesign.fitting.fit import fit_design, twin_samples, twin_without_visibility
+from lidardesign.fitting.fit import fit_design
 from lidardesign.fitting.request import FitRequest, RunTarget
+from lidardesign.methods.no_visibility import twin_samples, twin_without_visibility
 from lidardesign.run_folder import RunFolder
 from lidardesign.sensors.adaptive import mean_mbps
 from lidardesign.sensors.bandwidth import Bandwidth

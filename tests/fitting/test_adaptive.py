@@ -14,7 +14,6 @@ from lidardesign.api.run import open_run
 from lidardesign.constraints.check import check_design
 from lidardesign.errors import ConfigError
 from lidardesign.formats.designs import load_design
-from lidardesign.rays import adaptive
 from lidardesign.sensors.design_file import COLUMNS, design_document, design_from_document, save_design
 
 
@@ -38,13 +37,6 @@ def test_a_design_is_read_as_it_was_written_to_the_last_bit(tmp_path_factory, de
         assert one.dtype == other.dtype
         assert one.tobytes() == other.tobytes()
         assert one.shape == other.shape
-
-
-@pytest.fixture(scope="module", autouse=True)
-def few():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(adaptive, "MOST_SCENES", 60)
-        yield
 
 
 @pytest.fixture(scope="module")

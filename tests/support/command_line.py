@@ -48,10 +48,16 @@ def set_options(settings, further=()):
     return [word for setting in settings if setting.partition("=")[0] not in keys for word in ("--set", setting)]
 
 
+# Scenes of a run that is made: what a command does with one it does with all.
+FEW_SCENES = {"train": 8, "test": 6}
+
+
 def make_run(folder: Path, count: int = 4000, task: str = "flatland", seed: int = 3, overrides=()) -> Path:
     """A run as `learn` leaves it, with samples around two spots of its space instead of a learned density."""
     task = load_task(task)
-    config = resolve(task, preset="draft", seed=seed, overrides=overrides)
+    asked = {setting.partition("=")[0].removeprefix("task.") for setting in overrides}
+    few = [f"task.{key}={number}" for key, number in FEW_SCENES.items() if key not in asked]
+    config = resolve(task, preset="draft", seed=seed, overrides=[*few, *overrides])
     generator = np.random.default_rng(0)
     points = config.space.sample(count, generator)
     low, high = np.array(config.space.low), np.array(config.space.high)

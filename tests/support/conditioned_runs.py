@@ -20,7 +20,7 @@ def log_target(points):
 def make_conditioned_run(folder, count=6000, condition="[x_m]"):
     """A run of flatland, conditioned on where the sensor is, as `learn` leaves it."""
     task = load_task("flatland")
-    config = resolve(task, preset="draft", seed=3, overrides=[f"space.condition={condition}"])
+    config = resolve(task, preset="draft", seed=3, overrides=[f"space.condition={condition}", "train=8", "test=6"])
     generator = np.random.default_rng(0)
     points = config.space.sample(count, generator)
     start_manifest(folder, command=["lidardesign", "learn"], seed=3)
