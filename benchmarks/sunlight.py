@@ -147,8 +147,9 @@ def main() -> None:
 
 def measure(run_folder: Path, options: Any) -> None:
     """Fit, simulate and print."""
+    from support.scoring import entries_of
+
     from lidardesign import open_run
-    from lidardesign.evaluation.entries import entries_of
 
     run = open_run(run_folder)
     designs = [fitted(run_folder, f"sunlight-{n}", sensors=n, layout="even").specification for n in options.sensors]

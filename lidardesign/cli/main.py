@@ -18,6 +18,7 @@ from lidardesign.cli.commands.evaluate import evaluate
 from lidardesign.cli.commands.export import export, formats_app
 from lidardesign.cli.commands.fit import constrain, fit
 from lidardesign.cli.commands.learn import learn
+from lidardesign.cli.commands.methods import methods_app
 from lidardesign.cli.commands.show import show
 from lidardesign.cli.commands.simulate import simulate
 from lidardesign.cli.commands.studio import studio
@@ -102,6 +103,9 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "formats list": ("lidardesign formats list",),
     "formats show": ("lidardesign formats show mjcf",),
     "formats check": ("lidardesign formats check csv --json",),
+    "methods list": ("lidardesign methods list",),
+    "methods show": ("lidardesign methods show greedy",),
+    "methods check": ("lidardesign methods check greedy --json",),
     "config init": ("lidardesign config init meshes --set folder=scans --out scans.yaml",),
     "config schema": ("lidardesign config schema config --task face --out face.json",),
 }
@@ -118,6 +122,7 @@ PAGES = {
     "catalog": "catalog.md",
     "tasks": "writing-tasks.md",
     "formats": "formats.md, writing-methods.md",
+    "methods": "baselines.md, writing-methods.md",
     "config": "run-folder.md, shell.md",
 }
 
@@ -143,11 +148,19 @@ app = typer.Typer(
 )
 app.add_typer(tasks_app, name="tasks", context_settings=SETTINGS)
 app.add_typer(formats_app, name="formats", context_settings=SETTINGS)
+app.add_typer(methods_app, name="methods", context_settings=SETTINGS)
 app.add_typer(catalog_app, name="catalog", context_settings=SETTINGS)
 app.add_typer(config_app, name="config", context_settings=SETTINGS)
 for subcommand in (learn, fit, constrain, evaluate, studio, simulate, export, capture, show):
     app.command()(subcommand)
-groups = {"": app, "tasks ": tasks_app, "formats ": formats_app, "catalog ": catalog_app, "config ": config_app}
+groups = {
+    "": app,
+    "tasks ": tasks_app,
+    "formats ": formats_app,
+    "methods ": methods_app,
+    "catalog ": catalog_app,
+    "config ": config_app,
+}
 for prefix, group in groups.items():
     for registered in group.registered_commands:
         name = registered.name or registered.callback.__name__

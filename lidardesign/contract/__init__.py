@@ -1,4 +1,4 @@
-"""The contracts of plugins as testable laws: from Python, by `tasks check`, `formats check` and in pytest.
+"""The contracts of plugins as testable laws: from Python, by `check` of each kind and in pytest.
 
 `check_task(MyTask())` tries all of them; the modules are the groups of laws: `interface`, `scenes`,
 `scoring` and `contract`. The names here are loaded when they are used.
@@ -18,6 +18,7 @@ _HOMES = {
     "check_task": "contract",
     "contract_of": "contract",
     "contract_of_format": "contract",
+    "contract_of_method": "contract",
 }
 __all__ = sorted(_HOMES)
 

@@ -9,7 +9,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 
 from lidardesign.config import RunConfig, resolve
-from lidardesign.contract import formats, scenes, scoring
+from lidardesign.contract import formats, methods, scenes, scoring
 from lidardesign.contract.law import (
     CALL_SECONDS,
     BrokenLawError,
@@ -26,6 +26,7 @@ from lidardesign.contract.law import (
 from lidardesign.errors import ConfigError, LidardesignError, text_of
 from lidardesign.formats import Format, check_format
 from lidardesign.plugins import plugin_guard
+from lidardesign.problem.method import Method, check_method
 from lidardesign.task import Task, check_interface
 
 
@@ -66,6 +67,8 @@ LAWS = _with_conduct(
     *scenes.INTERFACE_LAWS, *scenes.SCENE_LAWS, *scoring.LAWS, after=("scores are numbers", "returns inform")
 )
 FORMAT_LAWS = _with_conduct(*formats.LAWS, after=("designs are written", "says what it holds", "rays come back"))
+METHOD_LAWS = _with_conduct(*methods.LAWS, after=("designs are made", "designs repeat"))
+LAWS_OF = {"task": LAWS, "format": FORMAT_LAWS, "method": METHOD_LAWS}
 
 
 class Contract:
@@ -77,8 +80,7 @@ class Contract:
 
     def __init__(self, subject: Tried) -> None:
         self.subject = subject
-        laws = LAWS if subject.noun == "task" else FORMAT_LAWS
-        self._laws: Mapping[str, Law] = {law.name: law for law in laws}
+        self._laws: Mapping[str, Law] = {law.name: law for law in LAWS_OF[subject.noun]}
         self._findings: dict[str, Finding] = {}
 
     def finding(self, name: str) -> Finding:
@@ -156,6 +158,17 @@ def contract_of_format(format: Format) -> Contract:
     with plugin_guard(str(getattr(format, "name", type(format).__name__)), "format"):
         check_format(str(getattr(format, "name", "")), format)
     return Contract(formats.FormatSubject(format))
+
+
+def contract_of_method(method: Method) -> Contract:
+    """The contract of a method, registered or not.
+
+    Raises:
+        PluginError: The method lacks a member of the interface.
+    """
+    with plugin_guard(str(getattr(method, "name", type(method).__name__)), "method"):
+        check_method(str(getattr(method, "name", "")), method)
+    return Contract(methods.MethodSubject(method))
 
 
 def check_task(task: Task, *, overrides: Sequence[str] = (), limit_s: float = CALL_SECONDS) -> list[Finding]:

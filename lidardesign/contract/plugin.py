@@ -1,7 +1,7 @@
-"""The contracts of plugins in pytest: a test that asks for `task_law` or `format_law` runs once per plugin and law.
+"""The contracts of plugins in pytest: `task_law`, `format_law` and `method_law` run a test per plugin and law.
 
-The plugins are those of the settings `lidardesign_tasks` and `lidardesign_formats` in the project's pytest
-configuration, one a line, tasks with settings as `--set` takes them:
+The plugins are those of the settings `lidardesign_tasks`, `lidardesign_formats` and `lidardesign_methods` in the
+project's pytest configuration, one a line, tasks with settings as `--set` takes them:
 
     [tool.pytest.ini_options]
     lidardesign_tasks = ["landmark train=3 test=3"]
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from lidardesign.contract.contract import Contract
 
 # Settings by fixture.
-SETTINGS = {"task_law": "lidardesign_tasks", "format_law": "lidardesign_formats"}
+SETTINGS = {"task_law": "lidardesign_tasks", "format_law": "lidardesign_formats", "method_law": "lidardesign_methods"}
 
 
 class PluginLaw:
@@ -50,7 +50,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addini(
         SETTINGS["task_law"], "tasks of lidardesign whose contract is tried: NAME [KEY=VALUE]...", type="linelist"
     )
-    parser.addini(SETTINGS["format_law"], "formats of lidardesign whose contract is tried: NAME", type="linelist")
+    for kind in ("format", "method"):
+        told = f"{kind}s of lidardesign whose contract is tried: NAME"
+        parser.addini(SETTINGS[f"{kind}_law"], told, type="linelist")
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
@@ -97,3 +99,13 @@ def format_law(request: pytest.FixtureRequest) -> PluginLaw:
 
     name, law = request.param
     return PluginLaw(contract_of_format(FORMATS.load(name)), law)
+
+
+@pytest.fixture
+def method_law(request: pytest.FixtureRequest, _contracts: dict[str, Contract]) -> PluginLaw:
+    """One law of the contract of one method that the setting `lidardesign_methods` names."""
+    from lidardesign.contract.contract import contract_of_method
+    from lidardesign.problem.method import METHODS
+
+    name, law = request.param
+    return PluginLaw(_contracts.setdefault(f"method {name}", contract_of_method(METHODS.load(name))), law)

@@ -30,6 +30,7 @@ from lidardesign.contract.law import (
 from lidardesign.errors import ConfigError, DataError, LidardesignError, PluginError
 from lidardesign.formats import FORMATS
 from lidardesign.plugins import PROBING, PluginKind
+from lidardesign.problem.method import METHODS
 from lidardesign.run.processes import START_SECONDS, Child, ChildError, write_line
 from lidardesign.task import TASKS
 
@@ -42,7 +43,7 @@ OVERTIME = 3
 CALLED = "called"
 FINDING_KEYS = {"law", "group", "statement", "outcome", "detail", "seconds", "figures"}
 REFUSALS = {"config": ConfigError, "data": DataError}
-KINDS: dict[str, PluginKind[Any]] = {kind.noun: kind for kind in (TASKS, FORMATS)}
+KINDS: dict[str, PluginKind[Any]] = {kind.noun: kind for kind in (TASKS, FORMATS, METHODS)}
 Statements = list[tuple[str, str, str]]
 
 
@@ -56,7 +57,7 @@ class CheckRequest:
         overrides: `KEY=VALUE` as `--set` takes it.
         seed: Root of all random numbers.
         limit_s: Time limit of one call of the plugin's code [s].
-        noun: What it is, a task or a format.
+        noun: What it is: a task, a format or a method.
     """
 
     name: str
@@ -158,10 +159,9 @@ def _not_reached(statements: Statements) -> Iterator[Finding]:
 
 def statements_of(noun: str) -> Statements:
     """Name, group and statement of what comes before all laws of a kind of plugins, then of each law."""
-    from lidardesign.contract.contract import FORMAT_LAWS, LAWS
+    from lidardesign.contract.contract import LAWS_OF
 
-    laws = LAWS if noun == "task" else FORMAT_LAWS
-    return [LOADS, *((law.name, law.group, law.statement) for law in laws)]
+    return [LOADS, *((law.name, law.group, law.statement) for law in LAWS_OF[noun])]
 
 
 def answer_check(request: dict[str, Any], result: BinaryIO) -> dict[str, Any]:
@@ -211,6 +211,10 @@ def _loaded(request: dict[str, Any], on_call: Callable[[str], None]) -> tuple[An
         from lidardesign.contract.formats import FormatSubject
 
         return plugin, FormatSubject(plugin, *conduct)
+    if kind is METHODS:
+        from lidardesign.contract.methods import MethodSubject
+
+        return plugin, MethodSubject(plugin, *conduct)
     config_file = Path(request["config_file"]) if request["config_file"] else None
     with restore_random_states(drawn, "space"):
         config = resolve(

@@ -22,6 +22,7 @@ from lidardesign.problem.method import API_VERSION, DESIGN
 from lidardesign.problem.problem import DesignResult, Problem, ray_design
 from lidardesign.problem.world import World
 from lidardesign.run.clock import phase
+from lidardesign.run.yaml import merged
 from lidardesign.scoring.fired import Positions
 from lidardesign.scoring.scene_scores import TrainingScorer
 from lidardesign.sensors.adaptive import mean_mbps
@@ -178,7 +179,8 @@ class CmaSearch:
         lists = self.positions(count)
         origin = {"search": asdict(self.searches[count][1])}
         if lists is self.starts[count]:
-            return replace(self.design, name=CMA, adaptive=None, provenance=origin)
+            constraints = merged(self.design.constraints, {"budget": {"rays": count}})
+            return replace(self.design, name=CMA, adaptive=None, constraints=constraints, provenance=origin)
         made = ray_design(CMA, lists, self.world, origin)
         used = np.unique(lists[0].sensor)
         sensors = [

@@ -58,7 +58,7 @@ class Greedy:
 
     def refuses(self, problem: Problem) -> str | None:
         """See `Method`: choosing many rays would take longer than all else in an evaluation."""
-        world, most = problem.world, MOST_CHOSEN // len(problem.world.conditions)
+        world, most = problem.world, _most_rays(problem)
         if world.training is None:
             return ""
         if not informs_rays(world.task):
@@ -71,26 +71,29 @@ class Greedy:
         if not len(views.observed(world.space)):
             found = world.known("even rays", lambda: even_layout(world.space)).within(problem)
             return None if found is None else DesignResult(ray_design(self.name, found, world))
-        choice = world.known((self.name, problem.gates), lambda: self._choice(problem, views))
+        most = max(problem.asked, *(count for count in problem.compared.counts if count <= _most_rays(problem)), 1)
+        choice = world.known((self.name, problem.gates, most), lambda: self._choice(problem, views, most))
         within = problem.rays is None
         lists = choice.positions_within(problem.limit_mbps) if within else choice.positions(problem.asked)
         return DesignResult(ray_design(self.name, lists, world))
 
-    def _choice(self, problem: Problem, views: TrainingReturns) -> GreedyChoice:
+    def _choice(self, problem: Problem, views: TrainingReturns, most: int) -> GreedyChoice:
         world, compared = problem.world, problem.compared
-        most = MOST_CHOSEN // len(world.conditions)
         scenes = [one["scenes"] for design in compared.designs for one in design.certificates]
-        counts = [count for count in compared.counts or [problem.asked] if count <= most]
         return GreedyChoice(
             views=views,
             spaces=world.spaces,
             training=world.training,
             scenes=max(scenes, default=USUAL_SCENES),
             gates_per_ray=problem.gates == "ray",
-            candidates=CANDIDATES_PER_RAY * max(counts),
+            candidates=CANDIDATES_PER_RAY * most,
             fired=compared.fired,
             bandwidth=problem.readout,
         )
+
+
+def _most_rays(problem: Problem) -> int:
+    return MOST_CHOSEN // len(problem.world.conditions)
 
 
 GREEDY = Greedy()

@@ -171,13 +171,23 @@ def _fine_points(found: Survey, count: int) -> tuple[np.ndarray, np.ndarray]:
     return points, unit[:, 0]
 
 
+def silhouette_layouts(views: TrainingReturns) -> list[Layout]:
+    """The layout; none where dense rays return nothing."""
+    return _layouts("silhouette", views, lattice_rays, 0.0, SILHOUETTE_SIGMAS)
+
+
+def lloyd_layouts(views: TrainingReturns) -> list[Layout]:
+    """The layout; none where dense rays return nothing."""
+    return _layouts("lloyd", views, _lloyd_rays, LLOYD_TAIL, LLOYD_SIGMAS)
+
+
 SILHOUETTE = LaidOut(
     "silhouette",
     "a lattice over all directions in which training scenes return",
-    lambda problem: _layouts("silhouette", returns_of(problem.world), lattice_rays, tail=0.0, sigmas=SILHOUETTE_SIGMAS),
+    lambda problem: silhouette_layouts(returns_of(problem.world)),
 )
 LLOYD = LaidOut(
     "lloyd",
     "like silhouette, denser where returns are frequent and surfaces large",
-    lambda problem: _layouts("lloyd", returns_of(problem.world), _lloyd_rays, tail=LLOYD_TAIL, sigmas=LLOYD_SIGMAS),
+    lambda problem: lloyd_layouts(returns_of(problem.world)),
 )

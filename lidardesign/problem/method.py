@@ -81,14 +81,14 @@ def design_by(method: Method, problem: Problem) -> DesignResult | None:
         result = method.design(problem)
     if result is None:
         return None
-    fault = _fault(result, problem, is_trusted=METHODS.is_shipped(method.name))
+    fault = fault_of(result, problem, is_trusted=METHODS.is_shipped(method.name))
     if fault is not None:
         raise PluginError(f"its design {fault}", where=f"method {method.name}")
     return result
 
 
-def _fault(result: Any, problem: Problem, *, is_trusted: bool) -> str | None:
-    """What a design is not that a problem asks for; of a trusted method its number of rays alone."""
+def fault_of(result: Any, problem: Problem, *, is_trusted: bool) -> str | None:
+    """What a design is not that a problem asks for; of a trusted one whether it can be fired alone."""
     design = getattr(result, "design", None)
     if not isinstance(design, DesignSpec):
         return f"is of type {type(design).__name__}"
@@ -97,10 +97,11 @@ def _fault(result: Any, problem: Problem, *, is_trusted: bool) -> str | None:
         lists = tuple(design.rays(count, at=condition or None) for condition in world.conditions)
     except LidardesignError as error:
         return f"cannot be fired: {error.message}"
-    if any(len(rays) != count for rays in lists):
-        return f"fires {len(lists[0])} rays, not {count}"
     if is_trusted:
         return None
+    # a fixed pattern would fire a subset of its rays
+    if design.count != count or any(len(rays) != count for rays in lists):
+        return f"fires {design.count} rays, not {count}"
     if mean_mbps(lists, problem.readout) > problem.limit_mbps * (1 + COARSE_SLACK):
         return f"needs {mean_mbps(lists, problem.readout):.6g} Mbit/s, more than {problem.limit_mbps:.6g}"
     for rays, space in zip(lists, world.spaces, strict=True):

@@ -35,8 +35,11 @@ def run(learned, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("name", ["uniform", "bounding", "greedy"])
 def test_a_baseline_as_a_design_scores_as_the_baseline_does(run, name):
-    design = run.baseline(name, rays=16)
+    with pytest.warns(DeprecationWarning, match=r"fit\(method="):
+        design = run.baseline(name, rays=16)
     assert design.save() == run.design_path(f"{name}-rays")
+    named = run.fit(method=name, rays=16)
+    np.testing.assert_array_equal(named.rays(16).direction, design.rays(16).direction)
     (own, row) = (row for row in run.evaluate([design], rays=[16]).rows if row.design in (name, f"{name}-rays"))
     np.testing.assert_allclose(own.per_scene, row.per_scene, rtol=1e-12)
     assert own.gates == row.gates
@@ -44,11 +47,20 @@ def test_a_baseline_as_a_design_scores_as_the_baseline_does(run, name):
     assert again.simulate(rays=16)[0].returns[0].rays.direction.shape == (16, 3)
 
 
-@pytest.mark.parametrize(("name", "said"), [("random", "no fixed list"), ("cma", "no fixed list"), ("x", "unknown")])
-def test_a_baseline_without_rays_of_its_own_is_not_saved(run, name, said):
-    with pytest.raises(ConfigError, match=said) as refused:
-        run.baseline(name)
-    assert "greedy" in str(refused.value.allowed)
+@pytest.mark.parametrize(
+    ("name", "choices", "said"),
+    [
+        ("random", {}, "draws other rays"),
+        ("cma", {}, "begins with a design"),
+        ("x", {}, "greedy"),
+        ("greedy", {"layout": "even"}, "beside layout"),
+        ("greedy", {"sensors": 2}, "leave out sensors"),
+        ("uniform", {"constraints": {"gate": {"width_m": {"max": 1.0}}}}, "leave out constraints"),
+    ],
+)
+def test_a_method_makes_no_design_that_is_another_in_every_scene_or_keeps_to_choices(run, name, choices, said):
+    with pytest.raises(ConfigError, match=said):
+        run.fit(method=name, **choices)
 
 
 @pytest.mark.parametrize("name", NOUNS)
@@ -140,8 +152,8 @@ def test_the_density_draws_the_same_points_for_the_same_seed(run):
     ("call", "where"),
     [
         (lambda run: run.fit(layout="spiral"), "layout"),
-        (lambda run: run.baseline("uniform", name="../x"), "name"),
-        (lambda run: run.baseline("uniform", rays=0), "rays"),
+        (lambda run: run.fit(method="uniform", name="../x"), "name"),
+        (lambda run: run.fit(method="uniform", rays=0), "rays"),
         (lambda run: run.fit(sensors=2, rays=0), "rays"),
         (lambda run: run.evaluate(baselines=["best"]), "baselines"),
         (lambda run: run.evaluate(baselines=["none", "lloyd"]), "baselines"),

@@ -9,9 +9,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from lidardesign.scoring.baselines.simple import OccupancyGrid
 from scipy.stats import chi2
-from support.baselines import SceneBaselines
+from support.baselines import problem_of, rays_of
 from support.chi_square import UNLIKELY, counts_of_cells, mass_of_cells, p_value
 from support.designs import sensor
 from support.flows import flow_of
@@ -25,6 +24,7 @@ from lidardesign.density.objective.visibility import Optics
 from lidardesign.density.training.learned import FlatTarget
 from lidardesign.density.training.losses import Pool
 from lidardesign.density.training.sampling import draw_samples, log_density_of, log_prob_of_unit
+from lidardesign.methods.occupancy import OccupancyGrid
 from lidardesign.mixture.bounds import sensor_groups
 from lidardesign.mixture.components import log_density
 from lidardesign.mixture.support import pin_samples, restrict_samples
@@ -306,7 +306,7 @@ def test_even_rays_are_even_over_a_wide_field_of_view_on_the_sphere():
 @pytest.mark.parametrize("name", ["random", "uniform"])
 def test_rays_of_the_plain_baselines_are_uniform_in_what_they_say(name, measure):
     space = DesignSpace((-1, 0, 0, 0.5, -1.2, 0.5), (1, 0, 0, 2.5, 1.4, 3.0), measure=measure)
-    rays = SceneBaselines(space, (), 3).positions(name, 4000)[0]
+    rays = rays_of(name, problem_of(space, (), 3, rays=4000))
     azimuth, elevation = angles(rays.direction)
     # even placements divide the angles; random ones are uniform in the space's own measure
     by_area = measure == "solid_angle" and name == "random"

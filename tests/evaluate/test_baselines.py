@@ -1,14 +1,16 @@
 """The simple baselines: exact numbers of rays, inside the space, the same every time."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from lidardesign.scoring.baselines.simple import check_baseline
-from lidardesign.scoring.baselines.views import unrolled
-from support.baselines import SceneBaselines, balls
+from support.baselines import balls, problem_of, rays_of
 
 from lidardesign.errors import ConfigError
+from lidardesign.evaluation.request import check_baseline
+from lidardesign.methods.returns import unrolled
+from lidardesign.problem.method import METHODS
 from lidardesign.scenes.scene import Body, Box, Scene, rigid
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.simulate.returns import simulate
@@ -28,7 +30,7 @@ BUILT = ["uniform", "random", "bounding", "silhouette", "occupancy"]
 
 def build_baseline(name, space, train, count, seed, judge=None):
     """A baseline at so many rays, for a space without conditions."""
-    return SceneBaselines(space, train, seed, judge).positions(name, count)[0]
+    return rays_of(name, problem_of(space, train, seed, judge, rays=count))
 
 
 CASES = {
@@ -50,10 +52,9 @@ def design_points(rays):
 @pytest.mark.parametrize("name", BUILT)
 def test_any_number_of_rays_is_met_exactly_inside_the_space_and_repeats(case, name):
     space, train = CASES[case]
-    source, same = (SceneBaselines(space, train, seed=4) for _ in range(2))
+    source, same = (problem_of(space, train, seed=4) for _ in range(2))
     for count in (0, 1, 2, 36, 101):
-        (rays,) = source.positions(name, count)
-        (again,) = same.positions(name, count)
+        rays, again = (rays_of(name, replace(one, rays=count)) for one in (source, same))
         assert len(rays) == count
         # angles pass through unit vectors and back: near the poles that costs half of the digits
         widened = DesignSpace(space.low, space.high, measure=space.measure)
@@ -131,15 +132,12 @@ def test_a_judge_decides_between_the_candidates_of_bounding():
 def test_as_many_rays_as_fit_in_a_bandwidth_fit_and_one_more_does_not(case, name, limit):
     space, train = CASES[case]
     bandwidth = Bandwidth()
-    source = SceneBaselines(space, train, seed=0)
-    (rays,) = source.positions_within(name, limit, bandwidth)
-    assert bandwidth.mbps(rays) <= limit
-    fitting = [
-        option.candidate
-        for option in source.options_within(name, limit, bandwidth)
-        if len(option.positions[0]) == len(rays)
-    ]
-    assert all(bandwidth.mbps(one.positions([space], len(rays) + 1)[0]) > limit for one in fitting)
+    problem = problem_of(space, train, limit_mbps=limit)
+    assert bandwidth.mbps(rays_of(name, problem)) <= limit
+    for layout in METHODS.load(name).layouts(problem):
+        (rays,) = layout.within(problem)
+        assert bandwidth.mbps(rays) <= limit
+        assert bandwidth.mbps(layout.positions([space], len(rays) + 1)[0]) > limit
 
 
 def test_the_seed_moves_only_the_random_baseline():

@@ -10,18 +10,17 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from lidardesign.scoring.baselines import cma
-from lidardesign.scoring.baselines.candidates import rays_at
-from lidardesign.scoring.baselines.cma import CmaCandidate, CmaSettings, MovableSensors
 from support.baselines import balls
-from support.scoring import HitTask, MissTask, make_request
+from support.scoring import HitTask, MissTask, entries_of, make_request
 from support.sensors import normal_sensor
 
 from lidardesign.api.scores import score_choices
 from lidardesign.cli.commands.evaluate import search_display
 from lidardesign.errors import ConfigError
-from lidardesign.evaluation.entries import entries_of
 from lidardesign.evaluation.score import evaluate
+from lidardesign.methods import cma
+from lidardesign.methods.cma import CmaSearch, CmaSettings, MovableSensors
+from lidardesign.methods.laid_out import rays_at
 from lidardesign.numerics import wrap_angle
 from lidardesign.parts.catalogue import Pose, find_part, part_design
 from lidardesign.scoring.scene_scores import TrainingScorer
@@ -201,7 +200,7 @@ def request_of(name, task=None, **changes):
         "baselines": ("bounding", "cma"),
         "train": AHEAD,
         "test": AHEAD,
-        "cma": FAST,
+        "settings": {"cma": FAST},
     }
     return make_request([design], **{**values, **changes})
 
@@ -226,7 +225,7 @@ def test_every_kind_of_design_is_followed_to_no_worse_a_score_in_no_more_bandwid
 
 @pytest.mark.parametrize("task", [AnyMissTask(), HitTask()])
 def test_the_search_gains_in_the_direction_of_the_metric(task):
-    (record,) = evaluate(request_of("even", task, cma=CmaSettings(math.inf, 1500))).searches
+    (record,) = evaluate(request_of("even", task, settings={"cma": CmaSettings(math.inf, 1500)})).searches
     sign = 1.0 if task.metric.better == "lower" else -1.0
     assert sign * record.value < sign * record.start_value - 10
 
@@ -251,11 +250,11 @@ def candidate_of(name, settings=FAST, seed=0, scenes=AHEAD):
     design, space = FOLLOWED[name]
     model = movable(name)
     scorer = TrainingScorer(AnyMissTask(), AnyMissTask.metric, 0, scenes, Planner(), keeps_casters=True)
-    return CmaCandidate(design, {12: model.start}, space, scorer, settings, seed, Bandwidth())
+    return CmaSearch(design, {12: model.start}, space, None, scorer, settings, seed, Bandwidth())
 
 
 def test_the_same_seed_and_number_of_evaluations_give_the_same_bytes():
-    first, again, other = (candidate_of("free", seed=seed).positions([], 12)[0] for seed in (1, 1, 2))
+    first, again, other = (candidate_of("free", seed=seed).positions(12)[0] for seed in (1, 1, 2))
     for key in ("origin_m", "direction", "gate_m"):
         assert getattr(first, key).tobytes() == getattr(again, key).tobytes()
     assert first.direction.tobytes() != other.direction.tobytes()
@@ -265,7 +264,7 @@ def test_a_search_ends_when_its_time_is_up(monkeypatch):
     now = itertools.count()
     monkeypatch.setattr(cma, "time", SimpleNamespace(perf_counter=lambda: float(next(now))))
     candidate = candidate_of("even", CmaSettings(60.0))
-    candidate.positions([], 12)
+    candidate.positions(12)
     _, record = candidate.searches[12]
     assert 60 <= record.seconds <= 70
     assert record.candidates > 1
@@ -273,7 +272,7 @@ def test_a_search_ends_when_its_time_is_up(monkeypatch):
 
 def test_where_nothing_is_gained_the_design_itself_is_the_answer():
     candidate = candidate_of("even", scenes=balls(np.array([-3.0, 0, 0])))
-    assert candidate.positions([], 12) is candidate.starts[12]
+    assert candidate.positions(12) is candidate.starts[12]
 
 
 def test_without_a_design_there_is_nothing_to_vary():
@@ -291,7 +290,7 @@ def test_each_search_has_a_line_that_shows_how_far_it_is_and_its_best_score():
     shown = []
     bar = SimpleNamespace(show=lambda done, total, **fields: shown.append((done / total, fields)))
     request = SimpleNamespace(cma_seconds=60.0, run=SimpleNamespace(metric=AnyMissTask.metric))
-    candidate_of("even", replace(FAST, show=search_display(request, bar))).positions([], 12)
+    candidate_of("even", replace(FAST, show=search_display(request, bar))).positions(12)
     shares, fields = zip(*shown, strict=True)
     assert list(shares) == sorted(shares)
     assert {one["line"] for one in fields} == {"cma, 12 rays"}

@@ -7,11 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.scoring import MissTask, make_request
+from support.scoring import MissTask, entries_of, make_request
 from support.sensors import normal_sensor
 
 from lidardesign.errors import ConfigError
-from lidardesign.evaluation.entries import entries_of
 from lidardesign.evaluation.score import evaluate
 from lidardesign.scenes.scene import Body, Box, Capsule, Scene, Sphere, rigid
 from lidardesign.sensors.bandwidth import Bandwidth
@@ -152,7 +151,7 @@ def test_a_twin_is_fitted_for_each_number_of_rays_alone_and_in_the_bandwidth_of_
 
     def twin(count, limit_mbps):
         asked.append((count, limit_mbps))
-        return DesignSpec("no-visibility", down[:2])
+        return DesignSpec("no-visibility", down[:2], constraints={"budget": {"rays": count}})
 
     request = make_request(
         [DesignSpec("d", down)], task=SeenTask(), space=CEILING, rays=(40, 80), baselines=("no-visibility",),

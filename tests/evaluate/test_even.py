@@ -4,13 +4,14 @@ import math
 
 import numpy as np
 import pytest
-from lidardesign.scoring.baselines.candidates import LayoutSite
-from lidardesign.scoring.baselines.even import Patch, Zone, bounding, central_field, even_placement
-from lidardesign.scoring.baselines.views import TrainingViews
 from scipy.spatial import ConvexHull, SphericalVoronoi, cKDTree
 from scipy.spatial.transform import Rotation
-from support.baselines import SceneBaselines, balls
+from support.baselines import balls, problem_of, rays_of
 
+from lidardesign.methods.bounding import bounding_layouts
+from lidardesign.methods.fields import Patch, Zone, central_field, even_placement
+from lidardesign.methods.laid_out import Site
+from lidardesign.methods.returns import TrainingReturns
 from lidardesign.scenes.scene import Body, Box, Scene, rigid
 from lidardesign.space import DesignSpace, angles, direction
 
@@ -121,8 +122,8 @@ def boxes(half, turn, places):
 @pytest.mark.parametrize("count", [64, 400])
 def test_bounding_from_straight_above_covers_as_well_as_a_plain_grid_in_the_tangent_plane(count):
     places = np.random.default_rng(2).normal((0, 0, 0.1), (0.02, 0.02, 0), (6, 3))
-    (layout,) = bounding(TrainingViews(DOWN, boxes((0.3, 0.2, 0.1), np.eye(3), places)))
-    points, gates = layout.lay_out(count, LayoutSite(DOWN))
+    (layout,) = bounding_layouts(TrainingReturns(DOWN, boxes((0.3, 0.2, 0.1), np.eye(3), places)))
+    points, gates = layout.lay_out(count, Site(DOWN))
     rays = direction(points[:, 3], points[:, 4])
     across, up = np.meshgrid(np.linspace(-0.3, 0.3, 60), np.linspace(-0.2, 0.2, 40))
     top = np.column_stack([across.ravel(), up.ravel()])
@@ -142,7 +143,7 @@ def test_turning_the_world_turns_bounding():
     areas = []
     for turn in PLACES.values():
         scenes = boxes((0.1, 0.4, 0.25), turn, [(1.5, 0.02 * i, 0) for i in range(4)])
-        (rays,) = SceneBaselines(SPHERE, scenes, 0).positions("bounding", 196)
+        rays = rays_of("bounding", problem_of(SPHERE, scenes, rays=196))
         local = rays.direction @ turn
         areas.append(ConvexHull(local[:, 1:] / local[:, :1]).volume)
     # rolls go in steps of 5 degrees, and few of the rays over the whole sphere see the box
@@ -152,8 +153,8 @@ def test_turning_the_world_turns_bounding():
 def test_along_an_aisle_every_place_has_a_crop_of_its_own():
     space = DesignSpace((0, 0, 0, 0, 0, 0.1), (3, 0, 0, math.pi, 0, 5.0), condition=("x_m",))
     scenes = balls(np.array([1.5, 1.5, 0.0]), 0.3, 0.02)
-    views = TrainingViews(space, scenes)
-    (layout,) = bounding(views)
+    views = TrainingReturns(space, scenes)
+    (layout,) = bounding_layouts(views)
     places = [0.0, 1.5, 3.0]
     found = layout.positions([space.at({"x_m": x}) for x in places], 20)
     for x, rays in zip(places, found, strict=True):
@@ -164,5 +165,5 @@ def test_along_an_aisle_every_place_has_a_crop_of_its_own():
         assert (np.abs(rays.gate_m.mean(axis=1) - np.linalg.norm(towards) + 0.15) < 0.15).all()
     # where nothing returns, the crop over all places stands
     blind = DesignSpace((0, 0, 0, 0, 0, 0.1), (30, 0, 0, math.pi, 0, 1.6), condition=("x_m",))
-    (layout,) = bounding(TrainingViews(blind, scenes))
+    (layout,) = bounding_layouts(TrainingReturns(blind, scenes))
     assert len(layout.positions([blind.at({"x_m": 29.0})], 7)[0]) == 7

@@ -7,16 +7,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from lidardesign.scoring.baselines import greedy as greedy_module
-from lidardesign.scoring.baselines.candidates import whole_range
-from lidardesign.scoring.baselines.greedy import Fired, GreedyCandidate, greedy_rays
-from lidardesign.scoring.baselines.views import TrainingViews
 from scipy.spatial import cKDTree
-from support.baselines import SceneBaselines, balls
-from support.scoring import MissTask, design, make_request, rows_by_key
+from support.baselines import SceneWorld, balls, problem_of, rays_of
+from support.scoring import MissTask, design, entries_of, make_request, rows_by_key
 
-from lidardesign.evaluation.entries import entries_of
 from lidardesign.evaluation.score import evaluate
+from lidardesign.methods import greedy as greedy_module
+from lidardesign.methods.greedy import GREEDY, GreedyChoice
+from lidardesign.methods.returns import TrainingReturns, whole_range
+from lidardesign.problem.problem import Fired, Problem
 from lidardesign.rays import information
 from lidardesign.rays.training_scenes import TrainingScenes
 from lidardesign.sensors.adaptive import mean_mbps
@@ -65,8 +64,8 @@ def training(task=None, seed=5):
 
 
 def candidate(space=AHEAD, fired=(), gates_per_ray=True, spaces=None, seed=1):
-    views = TrainingViews(space, scenes(seed))
-    return GreedyCandidate(
+    views = TrainingReturns(space, scenes(seed))
+    return GreedyChoice(
         views, spaces or [space], training(seed=seed), 24, gates_per_ray, 5 * max(COUNTS), fired, BANDWIDTH
     )
 
@@ -86,12 +85,12 @@ def test_numbers_of_rays_are_met_exactly_inside_the_space_and_no_bandwidth_is_ex
         fired = fired_at(bins)
         subject_of = candidate(space, fired, gates_per_ray, spaces)
         for count, mbps in fired:
-            positions = subject_of.positions(spaces, count)
+            positions = subject_of.positions(count)
             for here, rays in zip(spaces, positions, strict=True):
                 assert len(rays) == count
                 points = np.column_stack([rays.origin_m, *angles(rays.direction), rays.gate_m.mean(axis=1)])
                 assert here.contains(here.wrap(points)).all()
-            within = subject_of.positions_within(spaces, mbps, BANDWIDTH)
+            within = subject_of.positions_within(mbps)
             assert mean_mbps(within, BANDWIDTH) <= mbps * (1 + 1e-12)
             if gates_per_ray:
                 assert mean_mbps(positions, BANDWIDTH) <= mbps * (1 + 1e-12)
@@ -112,9 +111,9 @@ def test_returns_are_nearer_to_surfaces_than_those_of_even_and_random_rays_in_no
     space, held_out, count = SUBJECTS[subject], scenes(900, count=20), COUNTS[-1]
     ratios = []
     for seed in range(3):
-        baselines = SceneBaselines(space, scenes(seed), seed, gates_per_ray=True)
-        (even,), (random,) = (baselines.positions(name, count) for name in ("bounding", "random"))
-        (chosen,) = candidate(space, [Fired(count, BANDWIDTH.mbps(even))], seed=seed).positions([space], count)
+        problem = problem_of(space, scenes(seed), seed, gates="ray", rays=count)
+        even, random = (rays_of(name, problem) for name in ("bounding", "random"))
+        (chosen,) = candidate(space, [Fired(count, BANDWIDTH.mbps(even))], seed=seed).positions(count)
         assert BANDWIDTH.mbps(chosen) <= BANDWIDTH.mbps(even)
         ratios.append([distance(chosen, held_out) / distance(other, held_out) for other in (even, random)])
     to_even, to_random = np.mean(ratios, axis=0)
@@ -129,15 +128,15 @@ def arrays(positions):
 def test_a_choice_repeats_whatever_was_chosen_before_it():
     fired = fired_at(4)
     first, second = candidate(fired=fired), candidate(fired=fired)
-    upward = {count: first.positions([AHEAD], count) for count in COUNTS}
-    downward = {count: second.positions([AHEAD], count) for count in reversed(COUNTS)}
+    upward = {count: first.positions(count) for count in COUNTS}
+    downward = {count: second.positions(count) for count in reversed(COUNTS)}
     for count in COUNTS:
         for one, other in zip(arrays(upward[count]), arrays(downward[count]), strict=True):
             np.testing.assert_array_equal(one, other)
 
 
 def test_one_gate_for_all_is_that_of_the_crops_and_costs_what_it_costs():
-    (rays,) = candidate(fired=fired_at(1), gates_per_ray=False).positions([AHEAD], COUNTS[-1])
+    (rays,) = candidate(fired=fired_at(1), gates_per_ray=False).positions(COUNTS[-1])
     gates = np.unique(rays.gate_m, axis=0)
     assert len(gates) == 1
     assert np.diff(gates[0]) < np.diff(whole_range(AHEAD))
@@ -148,9 +147,9 @@ def test_rays_of_a_place_are_those_that_are_chosen_there_alone(monkeypatch):
     # how far a return tells follows from all returns, and which items are drawn from all items
     monkeypatch.setattr(information, "return_reach_m", lambda *arguments: 0.1)
     monkeypatch.setattr("lidardesign.rays.training_scenes.MOST_ITEMS", 3 * len(EVEN_ON_A_BALL))
-    together = candidate(ASIDE, gates_per_ray=False, spaces=PLACES).positions(PLACES, COUNTS[-1])
+    together = candidate(ASIDE, gates_per_ray=False, spaces=PLACES).positions(COUNTS[-1])
     for place, rays in zip(PLACES, together, strict=True):
-        alone = candidate(ASIDE, gates_per_ray=False, spaces=[place]).positions([place], COUNTS[-1])
+        alone = candidate(ASIDE, gates_per_ray=False, spaces=[place]).positions(COUNTS[-1])
         for one, other in zip(arrays([rays]), arrays(alone), strict=True):
             np.testing.assert_array_equal(one, other)
 
@@ -158,23 +157,25 @@ def test_rays_of_a_place_are_those_that_are_chosen_there_alone(monkeypatch):
 def test_bandwidth_is_spent_at_the_places_where_it_tells_most():
     spaces, count = [ASIDE.at({"y_m": value}) for value in (0.0, 0.6)], COUNTS[-1]
     limit = 2 * count * BIN_MBPS
-    rays = candidate(ASIDE, [Fired(count, limit)], spaces=spaces).positions(spaces, count)
+    rays = candidate(ASIDE, [Fired(count, limit)], spaces=spaces).positions(count)
     spent = [BANDWIDTH.mbps(one) for one in rays]
     assert np.mean(spent) <= limit * (1 + 1e-12)
     assert max(spent) > limit
 
 
 def test_many_rays_at_many_places_take_too_long():
-    counts, (note,) = greedy_rays(BallTask(), 4, (5, 500, 600))
-    assert (counts, "above 500 rays" in note) == ([5, 500], True)
+    world = SceneWorld(BallTask(), None, AHEAD, 0, training=training())
+    world.conditions.extend([{}] * 3)
+    reasons = [GREEDY.refuses(Problem(world, rays=count)) for count in (5, 500, 600)]
+    assert reasons == [None, None, "choosing more than 500 rays takes too long"]
 
 
 def aimed(counts=COUNTS):
     """The design beside `greedy`: even rays, each with a gate of its own that is longer than those of baselines."""
-    baselines = SceneBaselines(AHEAD, scenes(1), 3)
+    problem = problem_of(AHEAD, scenes(1), 3)
     patterns = []
     for count in counts:
-        (rays,) = baselines.positions("bounding", count)
+        rays = rays_of("bounding", replace(problem, rays=count))
         longer = np.linspace(0.2, 0.21, count)[:, None] * [-1, 1]
         patterns.append(Pattern.of(replace(rays, gate_m=rays.gate_m + longer)))
     return replace(design(), layout="chosen", patterns=tuple(patterns))
@@ -201,7 +202,7 @@ def test_an_evaluation_has_it_at_each_number_of_rays_in_no_more_bandwidth_than_t
 
 @pytest.mark.parametrize(
     ("changes", "note"),
-    [({"task": MissTask()}, "no method informs"), ({"rays": (5, 40)}, "above 30 rays"), ({"training": None}, None)],
+    [({"task": MissTask()}, "no method informs"), ({"rays": (5, 40)}, "more than 30 rays"), ({"training": None}, None)],
 )
 def test_it_is_left_out_with_one_note_where_rays_cannot_be_chosen(monkeypatch, changes, note):
     monkeypatch.setattr(greedy_module, "MOST_CHOSEN", 30)

@@ -5,10 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from lidardesign.scoring.baselines.candidates import LayoutSite
-from lidardesign.scoring.baselines.simple import AimedPoints, occupancy, occupancy_grid
-from lidardesign.scoring.baselines.views import RAY_AXES
+from support.baselines import problem_of
 
+from lidardesign.methods.laid_out import Site
+from lidardesign.methods.occupancy import AimedPoints, occupancy_grid, occupancy_layout
+from lidardesign.methods.returns import RAY_AXES
 from lidardesign.scenes.scene import Body, Box, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace, direction, observed_point
 
@@ -48,9 +49,9 @@ def distance_to_cells(grid, origins, directions, reach):
 @pytest.mark.parametrize("case", CASES)
 def test_every_ray_passes_through_an_occupied_cell_inside_the_space(case):
     space, train = CASES[case]
-    layout = occupancy(space, train, seed=2)
+    layout = occupancy_layout(problem_of(space, train, 2))
     grid = occupancy_grid(train, space, seed=2)
-    points, (start, end) = layout.lay_out(200, LayoutSite(space))
+    points, (start, end) = layout.lay_out(200, Site(space))
     assert points.shape[0] == 200
     looking = direction(points[:, 3], points[:, 4])
     assert distance_to_cells(grid, points[:, :3], looking, space.high[5]).mean() > 0.99
@@ -62,16 +63,16 @@ def test_every_ray_passes_through_an_occupied_cell_inside_the_space(case):
 
 def test_with_conditions_rays_start_at_the_position_and_end_in_its_cells():
     train = boxes()
-    layout, grid = occupancy(AISLE, train, seed=2), occupancy_grid(train, AISLE, seed=2)
+    layout, grid = occupancy_layout(problem_of(AISLE, train, 2)), occupancy_grid(train, AISLE, seed=2)
     for number, x in enumerate((0.5, 2.4)):
         space = AISLE.at({"x_m": x})
-        points = layout.lay_out(100, LayoutSite(space, number))[0]
+        points = layout.lay_out(100, Site(space, number))[0]
         assert (points[:, 0] == x).all()
         np.testing.assert_allclose(points[:, 3], -math.pi / 2)
         looking = direction(points[:, 3], points[:, 4])
         assert distance_to_cells(grid, points[:, :3], looking, 5.0).all()
     # beyond the last box nothing is occupied: rays are uniform there
-    nowhere = layout.lay_out(2000, LayoutSite(AISLE.at({"x_m": 3.9}), 2))[0]
+    nowhere = layout.lay_out(2000, Site(AISLE.at({"x_m": 3.9}), 2))[0]
     assert np.sin(nowhere[:, 4]).mean() == pytest.approx(0.5, abs=0.03)
 
 
@@ -105,19 +106,15 @@ def test_aiming_and_weighting_draw_the_same_rays():
 
 def test_what_was_asked_for_before_changes_no_draw():
     train = balls()
-    fresh, used = (occupancy(CEILING, train, seed=5) for _ in range(2))
-    used.lay_out(1500, LayoutSite(CEILING))
-    used.lay_out(10, LayoutSite(CEILING, scene=4))
+    fresh, used = (occupancy_layout(problem_of(CEILING, train, 5)) for _ in range(2))
+    used.lay_out(1500, Site(CEILING))
+    used.lay_out(10, Site(CEILING, draw=4))
     for count in (0, 1, 30):
-        np.testing.assert_array_equal(
-            fresh.lay_out(count, LayoutSite(CEILING))[0], used.lay_out(count, LayoutSite(CEILING))[0]
-        )
-    assert not np.array_equal(
-        fresh.lay_out(30, LayoutSite(CEILING))[0], fresh.lay_out(30, LayoutSite(CEILING, scene=1))[0]
-    )
+        np.testing.assert_array_equal(fresh.lay_out(count, Site(CEILING))[0], used.lay_out(count, Site(CEILING))[0])
+    assert not np.array_equal(fresh.lay_out(30, Site(CEILING))[0], fresh.lay_out(30, Site(CEILING, draw=1))[0])
 
 
 def test_targets_out_of_reach_and_no_scenes_leave_nothing_to_aim_at():
     behind = [Scene((Body(Sphere(0.1), poses=rigid(translation_m=(-3.0, 0, 0))),))]
-    assert occupancy(MEASURED, behind, seed=0) is None
-    assert occupancy(MEASURED, [], seed=0) is None
+    assert occupancy_layout(problem_of(MEASURED, behind, 0)) is None
+    assert occupancy_layout(problem_of(MEASURED, [], 0)) is None

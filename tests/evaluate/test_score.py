@@ -5,7 +5,6 @@ from io import StringIO
 
 import numpy as np
 import pytest
-from lidardesign.scoring.baselines import candidates
 from rich.console import Console
 from support.scoring import RAYS, HitTask, MissTask, design, make_request, rows_by_key, scenes
 
@@ -15,6 +14,7 @@ from lidardesign.estimates import mean_interval, paired_difference
 from lidardesign.evaluation.entries import FEWEST_BASELINE_SCENES
 from lidardesign.evaluation.results import csv_text, verdict
 from lidardesign.evaluation.score import evaluate
+from lidardesign.methods import laid_out
 from lidardesign.report.figures import scores_figure
 from lidardesign.report.tables import paired_tables
 from lidardesign.scenes.rays import Rays
@@ -103,7 +103,7 @@ def test_a_baseline_of_which_more_rays_fit_than_any_sensor_fires_is_left_out_at_
     request = make_request([design("wide", range_m=2.0, spread=0.1)])
     whole = evaluate(request)
     most = sorted({row.rays for row in whole.equal_bandwidth})[1]
-    monkeypatch.setattr(candidates, "MOST_RAYS", most)
+    monkeypatch.setattr(laid_out, "MOST_RAYS", most)
     found = evaluate(request)
     assert [row.design for row in found.equal_bandwidth] != [row.design for row in whole.equal_bandwidth]
     assert {(row.design, row.rays) for row in found.equal_bandwidth} <= {

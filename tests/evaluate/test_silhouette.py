@@ -4,13 +4,13 @@ import math
 
 import numpy as np
 import pytest
-from lidardesign.scoring.baselines.candidates import LayoutSite
-from lidardesign.scoring.baselines.even import bounding
-from lidardesign.scoring.baselines.silhouette import lloyd, silhouette, survey
-from lidardesign.scoring.baselines.views import TrainingViews
 from scipy.spatial import cKDTree
-from support.baselines import SceneBaselines, balls
+from support.baselines import balls, problem_of, rays_of
 
+from lidardesign.methods.bounding import bounding_layouts
+from lidardesign.methods.laid_out import Site
+from lidardesign.methods.returns import TrainingReturns
+from lidardesign.methods.silhouette import lloyd_layouts, silhouette_layouts, survey
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.space import DesignSpace, direction
@@ -30,13 +30,13 @@ SUBJECTS = {
         [scene for x in (-2, 2) for scene in balls(np.array([x, 0, 0.0]), 0.9, count=6, seed=x + 9)],
     ),
 }
-MAKE = {"silhouette": silhouette, "lloyd": lloyd}
+MAKE = {"silhouette": silhouette_layouts, "lloyd": lloyd_layouts}
 
 
 def laid_out(name, subject, count):
     space, scenes = SUBJECTS[subject]
-    (layout,) = MAKE[name](TrainingViews(space, scenes))
-    return layout.lay_out(count, LayoutSite(space))
+    (layout,) = MAKE[name](TrainingReturns(space, scenes))
+    return layout.lay_out(count, Site(space))
 
 
 @pytest.mark.parametrize("subject", SUBJECTS)
@@ -44,9 +44,9 @@ def laid_out(name, subject, count):
 def test_any_number_is_met_exactly_inside_the_space_where_scenes_return_and_repeats(subject, name):
     space, scenes = SUBJECTS[subject]
     casters = [SceneCaster(scene) for scene in scenes]
-    layouts = [MAKE[name](TrainingViews(space, scenes))[0] for _ in range(2)]
+    layouts = [MAKE[name](TrainingReturns(space, scenes))[0] for _ in range(2)]
     for count in (0, 1, 70):
-        (points, gates), (again, gates_again) = (one.lay_out(count, LayoutSite(space)) for one in layouts)
+        (points, gates), (again, gates_again) = (one.lay_out(count, Site(space)) for one in layouts)
         np.testing.assert_array_equal(points, again)
         np.testing.assert_array_equal(gates, gates_again)
         assert points.shape == (count, 5)
@@ -87,7 +87,7 @@ def test_a_silhouette_is_a_hexagonal_lattice_at_any_pole(subject):
 
 def test_lloyd_has_more_rays_where_returns_are_frequent_and_surfaces_large():
     space, scenes = SUBJECTS["ahead"]
-    found = survey(TrainingViews(space, scenes), space)
+    found = survey(TrainingReturns(space, scenes), space)
     points, _ = laid_out("lloyd", "ahead", 200)
     table = found.table
     density = table.share**0.75 * table.area_m2_sr**1.5
@@ -98,16 +98,16 @@ def test_lloyd_has_more_rays_where_returns_are_frequent_and_surfaces_large():
 @pytest.mark.parametrize("name", [*MAKE, "bounding"])
 def test_where_nothing_returns_there_is_no_candidate_and_the_baseline_is_uniform(name):
     nothing = balls(np.array([-3.0, 0, 0]))
-    assert name not in MAKE or MAKE[name](TrainingViews(AHEAD, nothing)) == []
-    baselines = SceneBaselines(AHEAD, nothing, 0)
-    assert np.array_equal(baselines.positions(name, 9)[0].direction, baselines.positions("uniform", 9)[0].direction)
+    assert name not in MAKE or MAKE[name](TrainingReturns(AHEAD, nothing)) == []
+    own, even = (rays_of(one, problem_of(AHEAD, nothing, rays=9)) for one in (name, "uniform"))
+    assert np.array_equal(own.direction, even.direction)
 
 
 @pytest.mark.parametrize("limit", [0.0, 0.1])
 @pytest.mark.parametrize("name", MAKE)
 def test_a_bandwidth_is_kept_and_used(name, limit):
     space, scenes = SUBJECTS["ahead"]
-    (rays,) = SceneBaselines(space, scenes, 0).positions_within(name, limit, Bandwidth())
+    rays = rays_of(name, problem_of(space, scenes, limit_mbps=limit))
     cost = Bandwidth().mbps(rays)
     assert cost <= limit
     assert cost >= 0.9 * limit - 0.003
@@ -116,9 +116,9 @@ def test_a_bandwidth_is_kept_and_used(name, limit):
 @pytest.mark.parametrize("subject", ["ahead", "straight down", "from a box"])
 def test_bounding_has_gates_per_ray_to_choose_where_a_design_has_them(subject):
     space, scenes = SUBJECTS[subject]
-    layouts = {layout.name: layout for layout in bounding(TrainingViews(space, scenes), gates_per_ray=True)}
-    assert len(layouts) == 2 * len(bounding(TrainingViews(space, scenes)))
-    plain, gated = (layouts[name].lay_out(100, LayoutSite(space)) for name in ("cropped", "cropped, a gate per ray"))
+    layouts = {layout.name: layout for layout in bounding_layouts(TrainingReturns(space, scenes), gates_per_ray=True)}
+    assert len(layouts) == 2 * len(bounding_layouts(TrainingReturns(space, scenes)))
+    plain, gated = (layouts[name].lay_out(100, Site(space)) for name in ("cropped", "cropped, a gate per ray"))
     np.testing.assert_array_equal(plain[0], gated[0])
     assert len(np.unique(plain[1], axis=0)) == 1
     assert Bandwidth().mbps_of_widths(np.diff(gated[1])) < 0.8 * Bandwidth().mbps_of_widths(np.diff(plain[1]))

@@ -7,13 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.evaluations import make_row
-from support.scoring import HitTask, MissTask, design, make_request, scenes
+from support.scoring import HitTask, MissTask, design, entries_of, make_request, scenes
 
 from lidardesign.evaluation.entries import (
     FEWEST_BASELINE_SCENES,
     LARGEST_BASELINE_SHARE,
     MOST_BASELINE_SCENES,
-    entries_of,
     mean_baseline,
 )
 from lidardesign.evaluation.results import middle_rays

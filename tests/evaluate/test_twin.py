@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from lidardesign.scoring.baselines.greedy import Fired
-from lidardesign.scoring.baselines.simple import TwinCandidate
 from support.command_line import make_run
 from support.conditioned_runs import make_conditioned_run
 from support.sensors import normal_sensor
@@ -15,10 +13,11 @@ from lidardesign.constraints.check import check_design
 from lidardesign.constraints.document import Constraints
 from lidardesign.density.objective.proposals import samples_without_visibility
 from lidardesign.errors import DataError, InfeasibleError
-from lidardesign.fitting import fit as fit_module
 from lidardesign.fitting.fit import fit_design
 from lidardesign.fitting.request import FitRequest, RunTarget
-from lidardesign.methods.no_visibility import twin_samples, twin_without_visibility
+from lidardesign.methods import no_visibility
+from lidardesign.methods.no_visibility import NO_VISIBILITY, twin_samples, twin_without_visibility
+from lidardesign.problem.problem import Comparison, Fired, Problem
 from lidardesign.run_folder import RunFolder
 from lidardesign.sensors.adaptive import mean_mbps
 from lidardesign.sensors.bandwidth import Bandwidth
@@ -41,7 +40,7 @@ SAMPLES = 3000
 
 @pytest.fixture(autouse=True)
 def few_samples(monkeypatch):
-    monkeypatch.setattr(fit_module, "TWIN_SAMPLES", SAMPLES)
+    monkeypatch.setattr(no_visibility, "TWIN_SAMPLES", SAMPLES)
 
 
 @pytest.fixture(scope="module")
@@ -139,11 +138,11 @@ def test_where_not_as_many_rays_fit_fewer_are_fired(most):
     def fit(count, limit_mbps):
         if count > most:
             raise InfeasibleError("too many rays", conflicts=["budget.bandwidth_mbps", "gate.width_m.min"])
-        return DesignSpec("aimed", (normal_sensor(),))
+        return DesignSpec("aimed", (normal_sensor(),), constraints={"budget": {"rays": count}})
 
-    candidate = TwinCandidate(fit, [{}], [Fired(24, 1.5), Fired(9, 1.0)])
-    (rays,) = candidate.positions_within([], 1.5, Bandwidth())
-    assert most * 0.8 - 1 <= len(rays) <= most
+    compared = Comparison(fired=[Fired(24, 1.5), Fired(9, 1.0)], refit=fit)
+    design = NO_VISIBILITY.design(Problem(None, limit_mbps=1.5, compared=compared)).design
+    assert most * 0.8 - 1 <= design.count <= most
 
 
 def test_constraints_that_contradict_each_other_are_no_matter_of_the_number_of_rays():
@@ -151,4 +150,4 @@ def test_constraints_that_contradict_each_other_are_no_matter_of_the_number_of_r
         raise InfeasibleError("no place is left", conflicts=["origin.exclude"])
 
     with pytest.raises(InfeasibleError, match="no place"):
-        TwinCandidate(fit, [{}], [Fired(24, 1.5)]).positions_within([], 1.5, Bandwidth())
+        NO_VISIBILITY.design(Problem(None, limit_mbps=1.5, compared=Comparison(fired=[Fired(24, 1.5)], refit=fit)))

@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from lidardesign.scoring.baselines.candidates import rays_at
-from lidardesign.scoring.baselines.even import even_placement
 from scipy.spatial.transform import Rotation
 from support.heads import ARM, EVERYTHING, FACE, FLATLAND, face_rays, heads, rays_of
 
+from lidardesign.methods.fields import even_placement
+from lidardesign.methods.laid_out import rays_at
 from lidardesign.scenes.rays import fire_times
 from lidardesign.scenes.scene import Body, Box, rigid
 from lidardesign.sensors.bandwidth import Bandwidth

@@ -7,11 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.rays import random_fan, rays_along
-from support.scoring import make_request
+from support.scoring import entries_of, make_request
 from support.sensors import normal_sensor
 from support.synthetic_light import PHOTON_EFFECTS
 
-from lidardesign.evaluation.entries import entries_of
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Ambient, Body, Medium, Scene, Sphere
 from lidardesign.scoring.fired import ONE_DEVICE, Devices, assign_devices

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidardesign.evaluation.request import EvaluationRequest
+from lidardesign.evaluation.entries import design_entries
+from lidardesign.evaluation.request import EvaluationRequest, fired_numbers
+from lidardesign.evaluation.rivals import rivals_of
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.space import DesignSpace
 from lidardesign.task import Defaults, Metric, Score, TaskConfig
@@ -72,6 +74,14 @@ def make_request(designs=None, **changes):
         "test": scenes(2),
     }
     return EvaluationRequest(**{**values, **changes})
+
+
+def entries_of(request):
+    """All entries of an evaluation: its designs, and their rivals."""
+    counts = fired_numbers(request.designs, request.rays)
+    designs = design_entries(request, counts)
+    shared = [count for count in counts if count not in request.alone]
+    return [*designs, *rivals_of(request, designs, shared).entries]
 
 
 def rows_by_key(evaluation):

@@ -6,11 +6,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from lidardesign.scoring.baselines.candidates import rays_at
 from lidardesign_tasks.meshes import TOLERATED_SHARE, MeshesTask
 from support.meshes import write_ball
 
 from lidardesign.errors import PluginError
+from lidardesign.methods.laid_out import rays_at
 from lidardesign.scoring.scene_scores import checked_score
 from lidardesign.simulate.returns import simulate
 from lidardesign.task import Metric, metric_of

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from lidardesign.scoring.baselines.candidates import rays_at
 from lidardesign_tasks.arm import ArmTask
 from lidardesign_tasks.emitter import EmitterTask
 from lidardesign_tasks.face import FaceTask
@@ -21,6 +20,7 @@ from lidardesign_tasks.warehouse import WarehouseTask
 from support.meshes import write_ball
 from support.rays import rays_along, rays_of_points
 
+from lidardesign.methods.laid_out import rays_at
 from lidardesign.scenes.scene import Body, Box, Mesh, Scene, rigid
 from lidardesign.scoring.scene_scores import checked_score, score_lists
 from lidardesign.simulate.detector.physics import Detector, Physics
