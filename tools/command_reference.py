@@ -28,6 +28,13 @@ examples; [in the shell](shell.md) is what holds for all commands.
 # Most commands have these; they are described once.
 COMMON = ("--seed", "--json", "--quiet", "--verbose", "--help")
 COMMON_HEAD = "## Options of most commands"
+# Groups whose commands are those of `tasks`, for other plugins.
+OTHER_PLUGINS = ("formats", "methods")
+OTHERS = """
+## formats, methods
+
+`list`, `show NAME` and `check NAME` are those of `tasks`, for [formats](formats.md) and [methods](baselines.md).
+"""
 
 
 def reference() -> str:
@@ -38,12 +45,12 @@ def reference() -> str:
     described: dict[tuple[str, str], str] = {}
     for path, command in commands:
         lines += ["", *_section(path, command, described)]
-    return "\n".join(lines) + "\n"
+    return "\n".join(lines) + "\n" + OTHERS
 
 
 def _commands(root: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
     for name, command in root.commands.items():
-        if command.hidden:
+        if command.hidden or name in OTHER_PLUGINS:
             continue
         if hasattr(command, "commands"):
             yield from _commands(command, (*path, name))

@@ -186,7 +186,7 @@ def test_the_drive_of_the_guide_is_scored_over_its_positions():
 
 
 def test_the_format_of_the_guide_is_short_and_keeps_every_law():
-    code = blocks("python", WRITING_METHODS)[0]
+    code = next(one for one in blocks("python", WRITING_METHODS) if "POINTS" in one)
     assert len(code.splitlines()) <= 35
     namespace: dict[str, object] = {}
     exec(code, namespace)  # the page's own text
