@@ -423,7 +423,7 @@ def test_no_test_imports_another_test():
     assert not imports
 
 
-# Syntax nodes of every room when version 0.1 was finished, of new rooms when they were made; `contract` got formats and methods.
+# Syntax nodes of every room when version 0.1 was finished, and of new ones; `contract` got formats and methods.
 NODES = {
     "__main__": 56, "api": 17_552, "choices": 3_700, "cli": 26_596, "clouds": 4_134, "config": 3_471,
     "constraints": 16_438, "contract": 12_600, "density": 57_483, "errors": 1_276, "estimates": 1_978,
