@@ -78,7 +78,7 @@ class PluginKind(Generic[T]):
 
     def listings(self) -> list[Listing]:
         """All installed ones by name, broken ones with the reason."""
-        with phase(f"{self.noun}s"):
+        with phase("plugins"):
             found = self._offers()
             foreign = [offers[0] for _, offers in sorted(found.items()) if len(offers) == 1 and _is_foreign(offers[0])]
             probed: dict[str, Listing | None] = {}
@@ -98,7 +98,7 @@ class PluginKind(Generic[T]):
 
     def loaded(self, name: str) -> tuple[T, Mapping[str, Any]]:
         """The one of a name, and what lists say of it; errors as of `load`."""
-        with phase(f"{self.noun}s"):
+        with phase("plugins"):
             offer = self.offer_of(name)
             if _is_foreign(offer):
                 _check_containable(self, name, offer.value, tuple(sys.path))

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from lidardesign.task import Task
 
 SCHEMA_KINDS = ("config", "constraints", "design", "evaluate")
-EVALUATE_SCHEMA = Path(__file__).parents[1] / "scoring" / "evaluation" / "evaluate.schema.json"
+EVALUATE_SCHEMA = Path(__file__).parents[1] / "evaluation" / "evaluate.schema.json"
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 NULL = {"type": "null"}
 WIDTH = 110

@@ -12,6 +12,7 @@ from lidardesign.errors import ConfigError, check_choice
 from lidardesign.fitting.options import DesignChoices, fit_choices
 from lidardesign.fitting.request import FitRequest
 from lidardesign.formats.designs import relative_folder
+from lidardesign.plugins import plugin_guard
 from lidardesign.problem.method import DESIGN, METHODS, Method, design_by, refusal_of
 from lidardesign.problem.problem import Problem
 from lidardesign.problem.world import World
@@ -102,8 +103,10 @@ class MethodRequest:
             "seed": world.seed,
             "versions": versions(),
         }
+        with plugin_guard(run.task.name):
+            mount = mount_of(run.task, run.config.task)
         provenance = {**result.design.provenance, **origin}
-        return replace(result.design, name=self.name, mount=mount_of(run.task, run.config.task), provenance=provenance)
+        return replace(result.design, name=self.name, mount=mount, provenance=provenance)
 
 
 def problem_of(

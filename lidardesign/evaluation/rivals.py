@@ -80,6 +80,7 @@ def rivals_of(request: EvaluationRequest, designs: Sequence[Entry], counts: Sequ
         ]
     for one in asked:
         _add(request, found, one)
+    problem.world.forget(but=[method.name for method in methods if method.is_redrawn])
     return found
 
 

@@ -72,6 +72,11 @@ class World:
             self._known[key] = make()
         return cast(Found, self._known[key])
 
+    def forget(self, but: Sequence[str] = ()) -> None:
+        """Forget what was found, but for methods by their names: casters of all scenes fill memory."""
+        for key in [one for one in self._known if not (isinstance(one, tuple) and one[0] in but)]:
+            del self._known[key]
+
     def scorer(self, *, keeps_casters: bool = False) -> TrainingScorer:
         """A scorer of the scenes that were learned from."""
         return TrainingScorer(

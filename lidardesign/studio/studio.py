@@ -84,7 +84,8 @@ class Studio:
         design = self.choices.design
         self._stage = Stage(self._server, design.specification, partial(self.wish, "handle"), self._drag)
         names = [*dict.fromkeys([*self.saved, design.name])]
-        self._panel = ControlPanel(self._server, self.choices, names, fixed_methods(), load_library().names, self.wish)
+        self._methods = fixed_methods()
+        self._panel = ControlPanel(self._server, self.choices, names, self._methods, load_library().names, self.wish)
         self._refresh()
 
     @property
@@ -234,7 +235,7 @@ class Studio:
     def _on_beside(self, value: Any) -> None:
         self._stage.remove("/beside")
         self._beside = self.saved.get(value)
-        if value in fixed_methods():
+        if value in self._methods:
             self._answers.ask("beside", partial(self._find_baseline, value, self.choices))
         self._refresh()
 

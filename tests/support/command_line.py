@@ -73,8 +73,9 @@ def make_run(folder: Path, count: int = 4000, task: str = "flatland", seed: int 
 
 
 def files_under(folder: Path) -> dict[str, bytes]:
-    """The content of every file in a folder, by its path."""
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    """The content of every file in a folder but compiled modules, by its path."""
+    paths = [path for path in folder.rglob("*") if path.is_file() and path.parent.name != "__pycache__"]
+    return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
 
 
 # A suite that runs in the background of a shell hands on that interruptions are ignored.
