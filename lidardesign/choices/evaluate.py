@@ -37,9 +37,8 @@ class EvaluateChoices(TypedDict, total=False):
             "seconds), or cma (direct optimisation of the first design's sensors on training scenes, for "
             "--cma-seconds). Repeatable. none: no baselines at all.",
             default=(),
-            words=("lloyd", "occupancy", "no-visibility", "cma"),
+            offers="methods",
             is_repeated=True,
-            is_open=True,
         ),
     ]
     cma_seconds: Annotated[

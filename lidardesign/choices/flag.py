@@ -31,7 +31,7 @@ class Flag:
         kind: What a text of the command line is read as.
         low, high: Limits of a number, both allowed.
         words: What it may be, which a shell is offered.
-        offers: What else a shell is offered: a function of `cli.terminal.completion`.
+        offers: What else a shell is offered: a function of `cli.terminal.options`.
         is_repeated: Whether it may be given several times.
         is_open: Whether it may be something else than `words`.
         is_required: Whether it has to be given.

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidardesign.errors import InfeasibleError
+from lidardesign.errors import InfeasibleError, PluginError
 from lidardesign.evaluation.entries import SINGLE, Entry
 from lidardesign.evaluation.request import EvaluationRequest
 from lidardesign.methods.cma import SearchRecord
@@ -34,13 +34,17 @@ class Rivals:
 
     Arguments:
         entries: The entries.
-        refused: Lines on methods that made no design.
+        notes: Lines on methods: why they made no design, and their own.
         unbounded: Designs and methods of which any number of rays fits in the design's bandwidth.
     """
 
     entries: list[Entry] = field(default_factory=list)
-    refused: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
     unbounded: set[tuple[str, str]] = field(default_factory=set)
+
+    def note(self, line: str) -> None:
+        """Add a line, once; an empty one is none."""
+        self.notes += [line] if line and line not in self.notes else []
 
 
 class Asked(NamedTuple):
@@ -62,7 +66,7 @@ def rivals_of(request: EvaluationRequest, designs: Sequence[Entry], counts: Sequ
     methods, found = [METHODS.load(name) for name in request.baselines], Rivals()
     if methods and len(request.conditions) > 1 and [*request.conditions[0]] not in [[name] for name in TRAVELLED]:
         names = " and ".join(request.conditions[0])
-        found.refused = [f"baselines are left out: rays follow where sensors stand, but not {names}"]
+        found.notes = [f"baselines are left out: rays follow where sensors stand, but not {names}"]
         return found
     problem = Problem(
         request.world(),
@@ -106,16 +110,19 @@ def _add(request: EvaluationRequest, found: Rivals, asked: Asked) -> None:
     problem = replace(asked.problem, config=request.settings.get(method.name))
     refusal = refusal_of(method, problem)
     if refusal is not None:
-        line = f"{method.name} is left out: {refusal}"
-        found.refused += [line] if refusal and line not in found.refused else []
+        found.note(f"{method.name} is left out: {refusal}" if refusal else "")
         return
     rays_of: Callable[[DesignSpec], Positions] = partial(fired, conditions=request.conditions, planner=request.planner)
     search, redraw = None, None
     try:
         result = design_by(method, problem)
+        if result is None and matched is None:
+            raise PluginError(f"makes no design of {problem.rays} rays", where=f"method {method.name}")
         if result is None:
-            found.unbounded.add((matched.name if matched else "", method.name))
+            found.unbounded.add((matched.name, method.name))
             return
+        for note in result.notes:
+            found.note(note)
         design = result.design
         count = design.count if problem.rays is None else problem.rays
         positions = rays_of(design, count)

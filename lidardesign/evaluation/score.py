@@ -289,7 +289,7 @@ def _notes(request: EvaluationRequest, entries: Sequence[Entry], rivals: Rivals,
         counted = f"rays and bandwidth are per position; every scene is seen from {positions} positions"
         notes.append(BackgroundNote(counted))
     notes += group_notes(request.test)
-    notes += rivals.refused
+    notes += rivals.notes
     with plugin_guard(request.task.name):
         notes += notes_of(request.task, request.config, request.space)
     for design in request.designs:

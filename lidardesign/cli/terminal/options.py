@@ -42,11 +42,8 @@ def _plugins(group: str) -> list[str]:
 
 
 def methods() -> list[str]:
-    """Layouts of `fit` and installed methods; none of them is imported."""
-    from lidardesign.choices.fit import LAYOUTS
-    from lidardesign.problem.method import METHODS
-
-    return [*LAYOUTS, *METHODS.names()]
+    """Installed methods; none of them is imported."""
+    return _plugins("lidardesign.methods")
 
 
 def parts() -> list[str]:
