@@ -60,13 +60,13 @@ class MethodRequest:
         method = METHODS.load(str(given["method"]))
         where = f"--method {method.name}"
         for key, flag in flags.items():
-            if key not in KEPT and choices[key] not in (None, flag.default, {}):  # type: ignore[literal-required]
-                raise ConfigError(
-                    f"{method.name} makes a design of its own", where=where, hint=f"leave out {flag.option}"
-                )
+            value = choices[key]  # type: ignore[literal-required]
+            if key not in KEPT and value and value != flag.default:
+                hint = f"leave out {flag.option}: lidardesign fit RUN --method {method.name}"
+                raise ConfigError("makes a design of its own, and keeps to no such choice", where=where, hint=hint)
         if DESIGN in method.needs or method.is_redrawn:
             fault = "draws other rays in every scene" if method.is_redrawn else "begins with a design"
-            raise ConfigError(f"it {fault}", where=where, hint="lidardesign methods list")
+            raise ConfigError(f"it {fault}", where=where, hint=f"lidardesign evaluate RUN --baseline {method.name}")
         numbers = sorted(run.task.defaults.rays)
         seed = run.config.seed if choices["seed"] is None else choices["seed"]
         config, training = run.config, TrainingScenes(run, seed)

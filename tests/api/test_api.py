@@ -54,8 +54,8 @@ def test_a_baseline_as_a_design_scores_as_the_baseline_does(run, name):
         ("cma", {}, "begins with a design"),
         ("x", {}, "greedy"),
         ("greedy", {"layout": "even"}, "beside layout"),
-        ("greedy", {"sensors": 2}, "leave out sensors"),
-        ("uniform", {"constraints": {"gate": {"width_m": {"max": 1.0}}}}, "leave out constraints"),
+        ("greedy", {"sensors": 2}, "keeps to no such choice"),
+        ("uniform", {"constraints": {"gate": {"width_m": {"max": 1.0}}}}, "keeps to no such choice"),
     ],
 )
 def test_a_method_makes_no_design_that_is_another_in_every_scene_or_keeps_to_choices(run, name, choices, said):
