@@ -222,7 +222,7 @@ def check_number(value: float, where: str, low: float, high: float, *, whole: bo
     """
     kinds = Integral if whole else Real
     if isinstance(value, bool) or not isinstance(value, kinds) or not low <= value <= high:
-        allowed = f"{'a whole number' if whole else 'a number'} from {low:.9g} to {high:.9g}"
+        allowed = f"a whole number from {low} to {high}" if whole else f"a number from {low:.9g} to {high:.9g}"
         raise ConfigError(f"{value!r}", where=where, allowed=allowed)
 
 
