@@ -62,8 +62,10 @@ class MethodRequest:
         for key, flag in flags.items():
             value = choices[key]  # type: ignore[literal-required]
             if key not in KEPT and value and value != flag.default:
-                hint = f"leave out {flag.option}: lidardesign fit RUN --method {method.name}"
-                raise ConfigError("makes a design of its own, and keeps to no such choice", where=where, hint=hint)
+                hint = f"leave it out: lidardesign fit RUN --method {method.name}"
+                raise ConfigError(
+                    f"makes a design of its own, and keeps to no such choice as {flag.option}", where=where, hint=hint
+                )
         if DESIGN in method.needs or method.is_redrawn:
             fault = "draws other rays in every scene" if method.is_redrawn else "begins with a design"
             raise ConfigError(f"it {fault}", where=where, hint=f"lidardesign evaluate RUN --baseline {method.name}")
@@ -94,6 +96,8 @@ class MethodRequest:
             raise ConfigError("makes no design", where=f"--method {self.method.name}")
         for note in result.notes:
             self.notes(note)
+        if self.problem.gates == "ray" and not result.design.has_gates_per_ray:
+            self.notes(f"the method {self.method.name} gives all rays of a sensor one gate, whatever --gates says")
         run, world = self.run, self.problem.world
         origin: Mapping[str, Any] = {
             "command": self.command,

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated, Any, TypedDict
 
 from lidardesign.choices.flag import Flag
-from lidardesign.choices.shared import Csv, Detector, Seed, SpaceOf, Workers
+from lidardesign.choices.shared import Detector, Seed, SpaceOf, Workers
 from lidardesign.limits import CMA_SECONDS, MAX_SEED, MOST_RAYS, RANGE_TOLERANCES_MM, RETURN_TOLERANCES
 
 
@@ -168,4 +168,4 @@ class EvaluateCommand(TypedDict, total=False):
     report: Annotated[
         Path | None, Flag("--report", "FILE.html", "Write one HTML page: tables, curves, 3D view.", kind=Path)
     ]
-    csv: Csv
+    csv: Annotated[Path | None, Flag("--csv", "FILE", "Write the rows as CSV.", kind=Path)]

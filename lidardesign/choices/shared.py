@@ -93,7 +93,6 @@ SpaceOf = Annotated[
         kind=Path,
     ),
 ]
-Csv = Annotated[Path | None, Flag("--csv", "FILE", "Write the rows as CSV.", kind=Path)]
 Json = Annotated[bool, Flag("--json", "", "Print one JSON document on stdout, for errors too.", default=False)]
 Quiet = Annotated[
     bool,

@@ -15,10 +15,10 @@ from lidardesign.cli.commands.capture import capture
 from lidardesign.cli.commands.catalog import catalog_app
 from lidardesign.cli.commands.config import config_app
 from lidardesign.cli.commands.evaluate import evaluate
-from lidardesign.cli.commands.export import export, formats_app
+from lidardesign.cli.commands.export import export
 from lidardesign.cli.commands.fit import constrain, fit
 from lidardesign.cli.commands.learn import learn
-from lidardesign.cli.commands.methods import methods_app
+from lidardesign.cli.commands.plugins import formats_app, methods_app
 from lidardesign.cli.commands.show import show
 from lidardesign.cli.commands.simulate import simulate
 from lidardesign.cli.commands.studio import studio

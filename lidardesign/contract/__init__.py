@@ -17,8 +17,7 @@ _HOMES = {
     "Contract": "contract",
     "check_task": "contract",
     "contract_of": "contract",
-    "contract_of_format": "contract",
-    "contract_of_method": "contract",
+    "contract_of_plugin": "contract",
 }
 __all__ = sorted(_HOMES)
 

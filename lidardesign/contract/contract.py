@@ -1,4 +1,4 @@
-"""The whole contracts of task plugins and of formats, law by law, each tried once.
+"""The whole contracts of task plugins, formats and methods, law by law, each tried once.
 
 The laws of random state and time are here, the others in the modules of their groups.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 from lidardesign.config import RunConfig, resolve
 from lidardesign.contract import formats, methods, scenes, scoring
@@ -24,9 +25,7 @@ from lidardesign.contract.law import (
     restore_random_states,
 )
 from lidardesign.errors import ConfigError, LidardesignError, text_of
-from lidardesign.formats import Format, check_format
-from lidardesign.plugins import plugin_guard
-from lidardesign.problem.method import Method, check_method
+from lidardesign.plugins import PluginKind, plugin_guard
 from lidardesign.task import Task, check_interface
 
 
@@ -68,6 +67,7 @@ LAWS = _with_conduct(
 )
 FORMAT_LAWS = _with_conduct(*formats.LAWS, after=("designs are written", "says what it holds", "rays come back"))
 METHOD_LAWS = _with_conduct(*methods.LAWS, after=("designs are made", "designs repeat"))
+SUBJECTS = {"format": formats.FormatSubject, "method": methods.MethodSubject}
 LAWS_OF = {"task": LAWS, "format": FORMAT_LAWS, "method": METHOD_LAWS}
 
 
@@ -149,26 +149,16 @@ def contract_of(
     return Contract(Subject(task, config, limit_s, drawn))
 
 
-def contract_of_format(format: Format) -> Contract:
-    """The contract of a format, registered or not.
+def contract_of_plugin(kind: PluginKind[Any], plugin: Any) -> Contract:
+    """The contract of a format or of a method, registered or not.
 
     Raises:
-        PluginError: The format lacks a member of the interface.
+        PluginError: The plugin lacks a member of the interface.
     """
-    with plugin_guard(str(getattr(format, "name", type(format).__name__)), "format"):
-        check_format(str(getattr(format, "name", "")), format)
-    return Contract(formats.FormatSubject(format))
-
-
-def contract_of_method(method: Method) -> Contract:
-    """The contract of a method, registered or not.
-
-    Raises:
-        PluginError: The method lacks a member of the interface.
-    """
-    with plugin_guard(str(getattr(method, "name", type(method).__name__)), "method"):
-        check_method(str(getattr(method, "name", "")), method)
-    return Contract(methods.MethodSubject(method))
+    name = str(getattr(plugin, "name", ""))
+    with plugin_guard(name or type(plugin).__name__, kind.noun):
+        kind.check(name, plugin)
+    return Contract(SUBJECTS[kind.noun](plugin))
 
 
 def check_task(task: Task, *, overrides: Sequence[str] = (), limit_s: float = CALL_SECONDS) -> list[Finding]:

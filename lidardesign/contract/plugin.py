@@ -92,20 +92,22 @@ def task_law(request: pytest.FixtureRequest, _contracts: dict[str, Contract]) ->
 
 
 @pytest.fixture
-def format_law(request: pytest.FixtureRequest) -> PluginLaw:
+def format_law(request: pytest.FixtureRequest, _contracts: dict[str, Contract]) -> PluginLaw:
     """One law of the contract of one format that the setting `lidardesign_formats` names."""
-    from lidardesign.contract.contract import contract_of_format
-    from lidardesign.formats import FORMATS
-
-    name, law = request.param
-    return PluginLaw(contract_of_format(FORMATS.load(name)), law)
+    return _plugin_law("format", *request.param, _contracts)
 
 
 @pytest.fixture
 def method_law(request: pytest.FixtureRequest, _contracts: dict[str, Contract]) -> PluginLaw:
     """One law of the contract of one method that the setting `lidardesign_methods` names."""
-    from lidardesign.contract.contract import contract_of_method
-    from lidardesign.problem.method import METHODS
+    return _plugin_law("method", *request.param, _contracts)
 
-    name, law = request.param
-    return PluginLaw(_contracts.setdefault(f"method {name}", contract_of_method(METHODS.load(name))), law)
+
+def _plugin_law(noun: str, name: str, law: str, contracts: dict[str, Contract]) -> PluginLaw:
+    from lidardesign.contract.contract import contract_of_plugin
+    from lidardesign.contract.process import KINDS
+
+    key = f"{noun} {name}"
+    if key not in contracts:
+        contracts[key] = contract_of_plugin(KINDS[noun], KINDS[noun].load(name))
+    return PluginLaw(contracts[key], law)

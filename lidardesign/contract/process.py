@@ -207,14 +207,10 @@ def _loaded(request: dict[str, Any], on_call: Callable[[str], None]) -> tuple[An
     kind, conduct = KINDS[request["noun"]], (request["seconds"], drawn, on_call)
     with restore_random_states(drawn, "import"):
         plugin, _ = kind.imported(EntryPoint(request["name"], request["value"], kind.group))
-    if kind is FORMATS:
-        from lidardesign.contract.formats import FormatSubject
+    if kind is not TASKS:
+        from lidardesign.contract.contract import SUBJECTS
 
-        return plugin, FormatSubject(plugin, *conduct)
-    if kind is METHODS:
-        from lidardesign.contract.methods import MethodSubject
-
-        return plugin, MethodSubject(plugin, *conduct)
+        return plugin, SUBJECTS[kind.noun](plugin, *conduct)
     config_file = Path(request["config_file"]) if request["config_file"] else None
     with restore_random_states(drawn, "space"):
         config = resolve(

@@ -14,7 +14,6 @@ from typing import Any
 
 from lidardesign.errors import ConfigError, PluginError
 from lidardesign.evaluation.mounting import MountError
-from lidardesign.plugins import plugin_guard
 from lidardesign.problem.method import METHODS
 from lidardesign.problem.world import World
 from lidardesign.rays.training_scenes import TrainingScenes
@@ -25,7 +24,7 @@ from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.simulate.plan import Planner
 from lidardesign.space import DesignSpace
-from lidardesign.task import Metric, Task, conditions_of, metric_of, mount_of
+from lidardesign.task import Metric, Task, mount_of
 from lidardesign.workers import Starmap
 
 # In the place of names: no baselines at all.
@@ -91,16 +90,19 @@ class EvaluationRequest:
     named: Sequence[str] = ()
 
     @cached_property
+    def world(self) -> World:
+        """The training scenes that baselines are made from."""
+        return World(self.task, self.config, self.space, self.seed, self.train, self.training, self.planner)
+
+    @property
     def metric(self) -> Metric:
         """The meaning of scores."""
-        with plugin_guard(self.task.name):
-            return metric_of(self.task, self.config)
+        return self.world.metric
 
-    @cached_property
+    @property
     def conditions(self) -> list[dict[str, float]]:
         """The condition values that are evaluated at; one empty entry without conditions."""
-        with plugin_guard(self.task.name):
-            return conditions_of(self.task, self.config, self.space)
+        return self.world.conditions
 
     @property
     def sensors_to_lose(self) -> dict[str, int]:
@@ -138,10 +140,6 @@ class EvaluationRequest:
     def scorer(self, scenes: Iterable[Scene]) -> TrainingScorer:
         """A scorer of training scenes, under the effects of the evaluation."""
         return TrainingScorer(self.task, self.metric, self.seed, scenes, self.planner)
-
-    def world(self) -> World:
-        """The training scenes that baselines are made from."""
-        return World(self.task, self.config, self.space, self.seed, self.train, self.training, self.planner)
 
 
 def check_baseline(name: str, *, where: str = "baselines") -> None:

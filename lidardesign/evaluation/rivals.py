@@ -69,7 +69,7 @@ def rivals_of(request: EvaluationRequest, designs: Sequence[Entry], counts: Sequ
         found.notes = [f"baselines are left out: rays follow where sensors stand, but not {names}"]
         return found
     problem = Problem(
-        request.world(),
+        request.world,
         readout=request.bandwidth,
         gates="ray" if any(design.has_gates_per_ray for design in request.designs) else "sensor",
         compared=_comparison(request, designs, counts),

@@ -147,10 +147,10 @@ class GreedyChoice:
 
     @cached_property
     def _chosen(self) -> Callable[[int, float], Positions]:
-        """`_choice`, which is made once."""
-        return cache(self._choice)
+        """`_choose`, which is called once for a number and a bandwidth."""
+        return cache(self._choose)
 
-    def _choice(self, count: int, limit_mbps: float) -> Positions:
+    def _choose(self, count: int, limit_mbps: float) -> Positions:
         """The choice of `count` rays at each value, within a bandwidth that is a mean over the values [Mbit/s]."""
         from lidardesign.rays.choice import choose, choose_within
 

@@ -63,6 +63,14 @@ def test_a_method_makes_no_design_that_is_another_in_every_scene_or_keeps_to_cho
         run.fit(method=name, **choices)
 
 
+@pytest.mark.parametrize(("name", "heeded"), [("greedy", True), ("uniform", False)])
+def test_a_method_that_gives_rays_no_gates_of_their_own_says_so(run, caplog, name, heeded):
+    with caplog.at_level("INFO", "lidardesign"):
+        design = run.fit(method=name, rays=16, gates="ray")
+    assert (len(np.unique(design.rays(16).gate_m, axis=0)) > 1) == heeded
+    assert ("one gate, whatever --gates says" in caplog.text) != heeded
+
+
 @pytest.mark.parametrize("name", NOUNS)
 def test_every_noun_has_an_example_that_runs(run, name):
     noun = getattr(lidardesign, name)

@@ -11,8 +11,9 @@ import pytest
 
 from lidardesign.config import resolve
 from lidardesign.constraints.document import Constraints
-from lidardesign.contract import contract_of_format
+from lidardesign.contract import contract_of_plugin
 from lidardesign.errors import LidardesignError
+from lidardesign.formats import FORMATS
 from lidardesign.run.yaml import parse_yaml
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Scene
@@ -190,7 +191,7 @@ def test_the_format_of_the_guide_is_short_and_keeps_every_law():
     assert len(code.splitlines()) <= 35
     namespace: dict[str, object] = {}
     exec(code, namespace)  # the page's own text
-    assert {one.outcome for one in contract_of_format(namespace["POINTS"]).findings()} == {"pass"}
+    assert {one.outcome for one in contract_of_plugin(FORMATS, namespace["POINTS"]).findings()} == {"pass"}
 
 
 @pytest.mark.parametrize("page", [ROOT / "README.md", *sorted(DOCS.glob("*.md"))], ids=lambda p: p.name)

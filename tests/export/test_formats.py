@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import tomllib
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
 from support.command_line import files_under
 from support.exports import write_as
-from support.plugins import install_plugins
+from support.plugins import check_entry_points, install_plugins
 from support.rigs import rig
 
 import lidardesign.formats
-from lidardesign.contract import contract_of_format
+from lidardesign.contract import contract_of_plugin
 from lidardesign.errors import DataError, PluginError
 from lidardesign.formats import FORMATS, Format, write_design
 from lidardesign.formats.designs import load_design
@@ -52,15 +50,7 @@ def test_the_shipped_formats_keep_the_contract(format_law):
 
 
 def test_pyproject_names_every_shipped_format_and_nothing_else():
-    homes = {}
-    for path in Path(lidardesign.formats.__file__).parent.glob("*.py"):
-        name = f"lidardesign.formats.{path.stem}"
-        for key, value in vars(import_module(name)).items() if path.stem != "__init__" else ():
-            homes |= {value.name: f"{name}:{key}"} if isinstance(value, Format) else {}
-    settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-    assert settings["project"]["entry-points"]["lidardesign.formats"] == homes
-    assert sorted(settings["tool"]["pytest"]["ini_options"]["lidardesign_formats"]) == sorted(homes)
-    assert [name for name in FORMATS.names() if FORMATS.is_shipped(name)] == sorted(homes)
+    check_entry_points(FORMATS, lidardesign.formats, lambda _, value: isinstance(value, Format))
 
 
 def test_loading_a_format_imports_no_other_module_of_formats():
@@ -199,7 +189,7 @@ def test_a_law_names_what_is_wrong(law):
         assert old in GOOD
         namespace: dict = {}
         exec(GOOD.replace(old, new).replace("NAME", "points"), namespace)
-        finding = contract_of_format(namespace["Plugin"]()).finding(law)
+        finding = contract_of_plugin(FORMATS, namespace["Plugin"]()).finding(law)
         assert finding.outcome == "fail", (law, new)
         assert words in finding.detail
 

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import re
 import sys
-import tomllib
-from importlib import import_module
 from pathlib import Path
 
 import pytest
 from support.command_line import files_under
-from support.plugins import install_plugins
+from support.plugins import check_entry_points, install_plugins
 
 import lidardesign.methods
-from lidardesign.contract import contract_of_method
+from lidardesign.contract import contract_of_plugin
 from lidardesign.problem.method import DESIGN, METHODS
 
 ROOT = Path(__file__).parents[2]
@@ -28,16 +26,13 @@ def test_the_shipped_methods_keep_the_contract(method_law):
 
 
 def test_pyproject_names_every_shipped_method_and_nothing_else():
-    homes = {}
-    for path in Path(lidardesign.methods.__file__).parent.glob("*.py"):
-        name = f"lidardesign.methods.{path.stem}"
-        for key, value in vars(import_module(name)).items() if path.stem != "__init__" else ():
-            if hasattr(value, "is_redrawn") and not isinstance(value, type) and key.isupper():
-                homes |= {value.name: f"{name}:{key}"}
-    settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-    assert settings["project"]["entry-points"]["lidardesign.methods"] == homes
-    tried = [name for name in homes if DESIGN not in METHODS.load(name).needs]
-    assert sorted(settings["tool"]["pytest"]["ini_options"]["lidardesign_methods"]) == sorted(tried)
+    def is_method(key, value):
+        return hasattr(value, "is_redrawn") and not isinstance(value, type) and key.isupper()
+
+    def begins_afresh(name):
+        return DESIGN not in METHODS.load(name).needs
+
+    check_entry_points(METHODS, lidardesign.methods, is_method, begins_afresh)
 
 
 @pytest.fixture
@@ -104,6 +99,6 @@ def test_a_broken_method_exits_6_and_nothing_else_is_lost(install, flat, lidarde
 def test_a_law_names_what_is_wrong_with_a_method():
     scope = {}
     exec(source_of("moody", (DESIGNS, DESIGNS + "        count += np.random.default_rng().integers(2)\n")), scope)
-    contract = contract_of_method(scope["Plugin"])
+    contract = contract_of_plugin(METHODS, scope["Plugin"])
     found = {finding.law: finding for finding in contract.findings()}
     assert "fail" in {found["designs are made"].outcome, found["designs repeat"].outcome}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tomllib
+from importlib import import_module
 from pathlib import Path
 
 # A small whole task that keeps the contract; broken ones are made of it by replacing words.
@@ -37,6 +39,21 @@ class Task:
         off = np.abs(np.linalg.norm(points - scene.truth["at"], axis=1) - 0.3).mean()
         return Score(min(1000 * off + 50 / len(points), 100.0))
 """
+
+
+def check_entry_points(kind, package, is_plugin, tried=None):
+    """All plugins of this kind in a package are entry points, and no others are; all of them, or some, are tried."""
+    homes = {}
+    for path in Path(package.__file__).parent.glob("*.py"):
+        name = f"{package.__name__}.{path.stem}"
+        for key, value in vars(import_module(name)).items() if path.stem != "__init__" else ():
+            homes |= {value.name: f"{name}:{key}"} if is_plugin(key, value) else {}
+    settings = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text(encoding="utf-8"))
+    assert homes
+    assert settings["project"]["entry-points"][kind.group] == homes
+    named = settings["tool"]["pytest"]["ini_options"][kind.group.replace(".", "_")]
+    assert sorted(named) == sorted(name for name in homes if tried is None or tried(name))
+    assert [name for name in kind.names() if kind.is_shipped(name)] == sorted(homes)
 
 
 def install_plugins(

@@ -1,4 +1,4 @@
-"""`lidardesign export`: write a design for other programs; `lidardesign formats`: the formats that it can take."""
+"""`lidardesign export`: write a design for other programs."""
 
 from __future__ import annotations
 
@@ -10,11 +10,10 @@ import typer
 
 from lidardesign.choices.files import ExportChoices, ExportCommand
 from lidardesign.choices.flag import complete
-from lidardesign.choices.listings import LawChoices
-from lidardesign.choices.shared import Brief, Printed
-from lidardesign.cli.commands.tasks import list_plugins, show_plugin, try_laws
+from lidardesign.choices.shared import Printed
+from lidardesign.cli.commands.plugins import print_formats
 from lidardesign.cli.terminal.grids import RichConsole
-from lidardesign.cli.terminal.options import command_line, formats
+from lidardesign.cli.terminal.options import command_line
 from lidardesign.cli.terminal.output import Output, announce, keep_times, written_file
 from lidardesign.errors import ConfigError
 from lidardesign.run.clock import phase
@@ -41,7 +40,7 @@ def export(
 ) -> None:
     """Write a design in another program's format."""
     if list_formats:
-        return _list(output)
+        return print_formats(output)
     with phase("libraries"):
         from lidardesign.api.export import DesignSource, ExportRequest, export_target, format_of
         from lidardesign.formats.designs import read_design
@@ -73,39 +72,3 @@ def export(
 
     document = {"design": str(design), **exported.as_dict()}
     output.result(document, show, files={"wrote": target} if output.quiet else None, says_time=True)
-
-
-formats_app = typer.Typer(help="List, show or check formats of exports.", no_args_is_help=True)
-FormatName = Annotated[str, typer.Argument(metavar="NAME", help="Name of a format.", autocompletion=formats)]
-
-
-@formats_app.command("list")
-@command_line(Brief)
-def list_(output: Output) -> None:
-    """List the installed formats; a broken one with its reason."""
-    _list(output)
-
-
-def _list(output: Output) -> None:
-    from lidardesign.formats import FORMATS
-
-    shown = {"format": "name", "suffix": "suffix", "what it is": "summary", "for": "reader"}
-    list_plugins(FORMATS, {**shown, "how that is checked": "checked"}, output)
-
-
-@formats_app.command("show")
-@command_line(Brief)
-def show(output: Output, name: FormatName) -> None:
-    """Show a format: what it is, who reads it, and what it holds."""
-    from lidardesign.formats import FORMATS
-
-    show_plugin(FORMATS, name, output)
-
-
-@formats_app.command("check")
-@command_line(LawChoices, Brief)
-def check(output: Output, name: FormatName, *, seconds: float) -> None:
-    """Check that a format keeps the contract. Every law is tried; exit 6 where one does not hold."""
-    from lidardesign.contract.process import CheckRequest
-
-    try_laws(CheckRequest(name, limit_s=seconds, noun="format"), output)

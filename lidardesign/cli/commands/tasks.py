@@ -4,25 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from lidardesign.choices.flag import complete
 from lidardesign.choices.listings import CheckCommand, NewCommand
 from lidardesign.choices.shared import Brief
+from lidardesign.cli.commands.plugins import list_plugins, try_laws
 from lidardesign.cli.terminal import options
 from lidardesign.cli.terminal.grids import RichConsole, text_table
 from lidardesign.cli.terminal.options import command_line
 from lidardesign.cli.terminal.output import Output
 from lidardesign.errors import pasted
 from lidardesign.run.clock import phase
-
-if TYPE_CHECKING:
-    from lidardesign.contract.process import CheckRequest
-    from lidardesign.plugins import PluginKind
-
-OUTCOMES = {"pass": ("pass", "green"), "fail": ("FAIL", "bold red"), "skip": ("skip", "dim")}
 
 tasks_app = typer.Typer(help="List, show, check or start tasks.", invoke_without_command=True)
 
@@ -44,28 +39,6 @@ def list_(
         from lidardesign.task import TASKS
 
     list_plugins(TASKS, {"task": "name", "what it is": "summary", "from": "distribution"}, output)
-
-
-def list_plugins(kind: PluginKind[Any], shown: Mapping[str, str], output: Output) -> None:
-    """Print all plugins of a kind; of a broken one its reason. A table shows some facts below headings."""
-    from rich.text import Text
-
-    entries: list[dict[str, Any]] = [
-        {"name": one.name, "summary": "", **one.facts, "distribution": one.distribution, "error": one.error}
-        for one in kind.listings()
-    ]
-    rows = []
-    for one in entries:
-        summary = Text.assemble(("broken:", "red"), f" {one['error']}") if one["error"] else one["summary"]
-        rows.append([{**one, "summary": summary}.get(key, "") for key in shown.values()])
-    output.result({f"{kind.noun}s": entries}, lambda rich: rich.print(text_table([*shown], rows)), show_costs=False)
-
-
-def show_plugin(kind: PluginKind[Any], name: str, output: Output) -> None:
-    """Print what a plugin's contract says of it."""
-    facts = {"name": name, **kind.loaded(name)[1], "distribution": kind.distribution_of(name)}
-    rows = [(key, ", ".join(fact) if isinstance(fact, list) else str(fact)) for key, fact in facts.items()]
-    output.result(facts, lambda rich: rich.print(text_table(("", ""), rows)), show_costs=False)
 
 
 @tasks_app.command("show")
@@ -139,41 +112,6 @@ def check(
     choices = complete(CheckCommand, given)
     try_laws(
         CheckRequest(name, choices["config"], tuple(choices["settings"]), choices["seed"], choices["seconds"]), output
-    )
-
-
-def try_laws(request: CheckRequest, output: Output) -> None:
-    """Try a plugin's contract and print the findings; raises BrokenLawError where a law does not hold."""
-    with phase("libraries"):
-        from lidardesign.contract.contract import refuse_broken
-        from lidardesign.contract.process import check_in_process, statements_of
-
-    findings, where = [], f"{request.noun} {request.name}"
-    with output.progress("contract") as progress, phase("contract"):
-        for finding in check_in_process(request):
-            findings.append(finding)
-            progress.show(len(findings), len(statements_of(request.noun)), detail=finding.law)
-    counts = {outcome: sum(finding.outcome == outcome for finding in findings) for outcome in OUTCOMES}
-    laws = [finding.as_dict() for finding in findings]
-    document = {request.noun: request.name, "keeps": not counts["fail"], **counts, "laws": laws}
-    output.result(document, lambda rich: _show_laws(where, document, rich))
-    refuse_broken(where, findings)
-
-
-def _show_laws(title: str, document: Mapping[str, Any], rich: RichConsole) -> None:
-    from rich.text import Text
-
-    table = text_table(("law", "", "what was found"), title=title)
-    group = ""
-    for law in document["laws"]:
-        if group and law["group"] != group:
-            table.add_section()
-        group = law["group"]
-        table.add_row(law["law"], Text(*OUTCOMES[law["outcome"]]), law["detail"])
-    rich.print(table)
-    rich.print(
-        f"laws that hold: {document['pass']}, broken: {document['fail']}, "
-        f"not applicable or not reached: {document['skip']}"
     )
 
 
