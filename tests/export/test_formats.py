@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from support.command_line import files_under
 from support.exports import write_as
-from support.plugins import check_entry_points, install_plugins
+from support.plugins import check_entry_points, install_fixture
 from support.rigs import rig
 
 import lidardesign.formats
@@ -62,14 +62,7 @@ def test_loading_a_format_imports_no_other_module_of_formats():
     assert set(done.stdout.split()) == {"lidardesign.formats.ray_lists", "lidardesign.formats.rig"}
 
 
-@pytest.fixture
-def install(tmp_path, monkeypatch):
-    """Install formats of another package by name."""
-    place = tmp_path / "installed"
-    monkeypatch.syspath_prepend(place)
-    yield lambda sources: install_plugins(place, sources, module="hard_formats", group="lidardesign.formats")
-    for name in [name for name in sys.modules if name.startswith("hard_formats")]:
-        del sys.modules[name]
+install = install_fixture("format")
 
 
 @pytest.fixture

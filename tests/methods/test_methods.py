@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import re
-import sys
 from pathlib import Path
 
 import pytest
 from support.command_line import files_under
-from support.plugins import check_entry_points, install_plugins
+from support.plugins import check_entry_points, install_fixture
 
 import lidardesign.methods
 from lidardesign.contract import contract_of_plugin
@@ -35,14 +34,7 @@ def test_pyproject_names_every_shipped_method_and_nothing_else():
     check_entry_points(METHODS, lidardesign.methods, is_method, begins_afresh)
 
 
-@pytest.fixture
-def install(tmp_path, monkeypatch):
-    """Install methods of another package by name."""
-    place = tmp_path / "installed"
-    monkeypatch.syspath_prepend(place)
-    yield lambda sources: install_plugins(place, sources, module="hard_methods", group="lidardesign.methods")
-    for name in [name for name in sys.modules if name.startswith("hard_methods")]:
-        del sys.modules[name]
+install = install_fixture("method")
 
 
 def source_of(name, *changes):

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 import tomllib
 from importlib import import_module
 from pathlib import Path
+
+import pytest
 
 # A small whole task that keeps the contract; broken ones are made of it by replacing words.
 GOOD = """
@@ -77,3 +80,18 @@ def install_plugins(
     (made / "entry_points.txt").write_text("\n".join([f"[{group}]", *lines, ""]))
     for name, source in sources.items():
         (place / f"{prefix}_{name}.py").write_text(source.replace("NAME", name))
+
+
+def install_fixture(noun):
+    """A fixture that installs formats or methods of another package by name, and forgets them at the end."""
+    module = f"hard_{noun}s"
+
+    @pytest.fixture
+    def install(tmp_path, monkeypatch):
+        place = tmp_path / "installed"
+        monkeypatch.syspath_prepend(place)
+        yield lambda sources: install_plugins(place, sources, module=module, group=f"lidardesign.{noun}s")
+        for name in [name for name in sys.modules if name.startswith(module)]:
+            del sys.modules[name]
+
+    return install
