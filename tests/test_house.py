@@ -36,6 +36,8 @@ HOMES = {
     "click": ("cli.",),
     "rich": ("cli.",),
     "plotly": ("report.",),
+    "jinja2": ("run.markup",),
+    "markupsafe": ("run.markup",),
     "matplotlib": (),
     "viser": ("studio.",),
     "websockets": ("studio.server",),
@@ -48,6 +50,7 @@ HOMES = {
 }
 SLOW_AT_TOP = {
     "torch", "cma", "numba", "trimesh", "matplotlib", "plotly", "igl", "h5py", "scipy", "zuko", "embreex",
+    "jinja2", "markupsafe",
 }  # fmt: skip
 FAST_ROOMS = (
     "limits", "run", "choices", "run_folder", "workers", "sensors", "parts", "constraints", "mixture", "fitting",
@@ -275,6 +278,15 @@ def test_libraries_stay_in_their_homes():
             if homes and not f"{name.removeprefix('lidardesign.')}.".startswith(tuple(homes)):
                 astray.append(f"{name}:{line}: {target}")
     assert not astray
+
+
+def test_tags_of_pages_stand_in_templates():
+    tag = re.compile(r"</(p|div|table|t[rdh]|span|section|svg|label|button|details|figure|iframe)>")
+    written = []
+    for name, tree in package().items():
+        texts = [node for node in nodes_of(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)]
+        written += [f"{name}:{text.lineno}" for text in texts if tag.search(text.value)]
+    assert not written
 
 
 def top_imports(tree: ast.Module) -> list[tuple[str, int]]:

@@ -132,7 +132,7 @@ def test_the_wheel_holds_every_module_and_data_file_and_no_tests(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
     expected = {path.relative_to(ROOT).as_posix() for path in (ROOT / "lidardesign").rglob("*.py")}
     expected |= {path.relative_to(ROOT / "tasks").as_posix() for path in (ROOT / "tasks").rglob("*.py")}
-    for data in ("py.typed", "*.json", "*.yaml", "*.css", "*.js", "template/*.txt"):
+    for data in ("py.typed", "*.json", "*.yaml", "*.css", "*.js", "templates/*", "template/*.txt"):
         found = {path.relative_to(ROOT).as_posix() for path in (ROOT / "lidardesign").rglob(data)}
         assert found, data
         expected |= found

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -28,6 +27,7 @@ from lidardesign.formats.designs import need_run, relative_folder
 from lidardesign.rays.information import FEW_SCENES
 from lidardesign.run.clock import WAIT_S, Progress, phase
 from lidardesign.run.manifest import locked_run, write_recorded
+from lidardesign.run.markup import rendered
 from lidardesign.run_folder import Notes, RunFolder, ignore, log_note, settings_texts
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Scene
@@ -267,11 +267,5 @@ class Design(DesignSource):
 
 
 def html_table(caption: str, headings: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """A small table for notebooks; every text is escaped."""
-
-    def line(cells: Sequence[object], kind: str) -> str:
-        return "<tr>" + "".join(f"<{kind}>{html.escape(str(cell))}</{kind}>" for cell in cells) + "</tr>"
-
-    body = "".join(line(row, "td") for row in rows)
-    head = f"<thead>{line(headings, 'th')}</thead>" if headings else ""
-    return f"<table><caption>{html.escape(caption)}</caption>{head}<tbody>{body}</tbody></table>"
+    """A small table for notebooks."""
+    return rendered("api/templates/table.html", caption=caption, headings=headings, rows=rows)

@@ -6,9 +6,8 @@ source says of a part stands there as unknown.
 
 from __future__ import annotations
 
-import html
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -25,6 +24,7 @@ from lidardesign.parts.catalogue import parts_of
 from lidardesign.parts.part import Part
 from lidardesign.run.arrays import csv_table
 from lidardesign.run.files import write_folder
+from lidardesign.run.markup import fixed, rendered
 from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.sensor import Sensor, boresight_frame, boresight_of
@@ -138,11 +138,12 @@ def write_mounts(design: DesignSpec, rays: Rays, path: Path, _: object = None) -
     poses = [(one.name, one.sensor.origin_m, one.roll_pitch_yaw_rad) for one in mounted]
     links = [part for pose in poses for part in fixed_link(*pose, parent=parent)]
     robot = element("robot", {"name": identifier(design.name)}, [element("link", {"name": parent}), *links])
+    commands = _transforms(mounted, parent)
     files = {
-        "mounts.html": _page(design, mounted, frame, parent).encode(),
+        "mounts.html": _page(design, mounted, commands).encode(),
         "mounts.csv": csv_table([rows[0], *(row.values() for row in rows)]).encode(),
         "mounts.urdf": document(robot),
-        "static_transforms.sh": "".join(f"{line} &\n" for line in _transforms(mounted, parent)).encode() + b"wait\n",
+        "static_transforms.sh": "".join(f"{line} &\n" for line in commands).encode() + b"wait\n",
     }
     notes = write_folder(path, files)
     regions = [one.sensor.region_m for one in mounted if one.sensor.region_m > 0]
@@ -189,218 +190,102 @@ def _transforms(mounted: Sequence[MountedPart], parent: str) -> list[str]:
 
 # Views from three sides: their name, the axes to the right and upwards, and the axis and sign towards the viewer.
 VIEWS = (("from the front (+x)", 1, 2, 0, 1), ("from the right (-y)", 0, 2, 1, -1), ("from above (+z)", 0, 1, 2, 1))
-WIDTH, HEIGHT, EDGE = 340.0, 270.0, 58.0
+WIDTH, HEIGHT, EDGE = 340, 270, 58
 ARROW, UPRIGHT = 30.0, 12.0  # lengths of arrows and of marks of what is up
 HEAD_ON = 0.25  # the share of an arrow across the view below which it is a ring
 APART = 11.0  # of numbers along an edge
 SAME_MM = 0.05
+QUESTIONS = {
+    "up": "which side is up",
+    "origin": "where rays start on the part",
+    "zone_0": "where the first zone looks",
+}
 
 
-def _sketch(mounted: Sequence[MountedPart], title: str, across: int, up: int, depth: int, sign: int) -> str:
+def _page(design: DesignSpec, mounted: Sequence[MountedPart], commands: Sequence[str]) -> str:
+    """The page to print."""
+    open_questions = [text for name, text in QUESTIONS.items() if any(one.stated(name) == UNKNOWN for one in mounted)]
+    return rendered(
+        "formats/templates/mounts.html",
+        design=design,
+        mounted=mounted,
+        unknown=UNKNOWN,
+        poses=[_pose(one) for one in mounted],
+        views=[_view(mounted, *view) for view in VIEWS],
+        width=WIDTH,
+        height=HEIGHT,
+        edge=EDGE,
+        parts=[*map(_part, mounted), ["in all", *[""] * 8, _total(mounted, "power_w", " W"), _total(mounted, "price")]],
+        missing=open_questions if any(one.sensor.part is not None for one in mounted) else [],
+        is_unverified=any("unverified" in one.stated("zone_0") for one in mounted),
+        commands=commands,
+    )
+
+
+def _view(mounted: Sequence[MountedPart], title: str, across: int, up: int, depth: int, sign: int) -> dict[str, Any]:
     """One view: places with their coordinates along the edges, arrows along the optical axes, marks of what is up."""
-    places_mm = MM_PER_M * np.array([one.sensor.origin_m for one in mounted])[:, [across, up]]
+    places_mm = np.round(MM_PER_M * np.array([one.sensor.origin_m for one in mounted])[:, [across, up]], 1)
     low, high = places_mm.min(axis=0), places_mm.max(axis=0)
     room = np.array([WIDTH, HEIGHT]) - 2 * EDGE - np.array([30.0, 0.0])
     extent = high - low
     scale = float((room[extent > SAME_MM] / extent[extent > SAME_MM]).min()) if (extent > SAME_MM).any() else 1.0
-    middle = (low + high) / 2
-
-    def drawn(place_mm: np.ndarray) -> np.ndarray:
-        right, top = scale * (place_mm - middle)
-        return np.array([WIDTH / 2 + 20 + right, HEIGHT / 2 - 10 - top])
-
-    lines, at = [], {}
-    for one, place_mm in zip(mounted, places_mm, strict=True):
-        at.setdefault(tuple(np.round(place_mm, 1)), []).append(one)
-    for place, here in at.items():
-        x, y = drawn(np.array(place))
-        for one in here:
-            forward, _, top = one.axes
-            lines.append(_arrow(x, y, forward[[across, up]], float(sign * forward[depth])))
-            mark = UPRIGHT * top[[across, up]]
-            lines.append(f'<line class="up" x1="{x:.1f}" y1="{y:.1f}" x2="{x + mark[0]:.1f}" y2="{y - mark[1]:.1f}"/>')
-        names = html.escape(", ".join(one.name for one in here))
-        lines += [
-            f'<rect x="{x - 3:.1f}" y="{y - 3:.1f}" width="6" height="6"/>',
-            f'<text class="name" x="{x + 6:.1f}" y="{y - 6:.1f}">{names}</text>',
-        ]
-    lines += _ordinates(places_mm[:, 0], lambda value: float(drawn(np.array([value, low[1]]))[0]), along=True)
-    lines += _ordinates(places_mm[:, 1], lambda value: float(drawn(np.array([low[0], value]))[1]), along=False)
-    titles = (
-        f'<text x="{WIDTH / 2:.0f}" y="12" text-anchor="middle" class="title">{title}</text>'
-        f'<text x="{WIDTH - 4:.0f}" y="{HEIGHT - 4:.0f}" text-anchor="end">{"xyz"[across]} [mm] to the right</text>'
-        f'<text x="4" y="24">{"xyz"[up]} [mm] upwards</text>'
-    )
-    return f'<svg viewBox="0 0 {WIDTH:.0f} {HEIGHT:.0f}" role="img" aria-label="{title}">{titles}{"".join(lines)}</svg>'
+    drawn = (places_mm - (low + high) / 2) * (scale, -scale) + (WIDTH / 2 + 20, HEIGHT / 2 - 10)
+    parts: dict[tuple[float, ...], list[dict[str, Any]]] = {}
+    for one, place in zip(mounted, drawn.tolist(), strict=True):
+        forward, _, top = one.axes
+        right, upwards = forward[[across, up]]
+        share = math.hypot(right, upwards)
+        part = {
+            "name": one.name,
+            "is_head_on": share < HEAD_ON,
+            "is_away": sign * forward[depth] < 0,
+            "length": ARROW * share,
+            "turn_deg": math.degrees(math.atan2(-upwards, right)),
+            "top": UPRIGHT * top[[across, up]] * (1, -1),
+        }
+        parts.setdefault(tuple(place), []).append(part)
+    return {
+        "title": title,
+        "across": "xyz"[across],
+        "up": "xyz"[up],
+        "places": list(parts.items()),
+        "columns": _labels(places_mm[:, 0], drawn[:, 0], WIDTH - EDGE),
+        "rows": _labels(places_mm[:, 1], drawn[:, 1], HEIGHT - EDGE),
+    }
 
 
-def _arrow(x: float, y: float, looks: np.ndarray, nearer: float) -> str:
-    """An arrow along the optical axis; a dot where it points at the viewer, a cross where it points away."""
-    if np.hypot(*looks) < HEAD_ON:
-        ring = f'<circle cx="{x:.1f}" cy="{y:.1f}" r="7"/>'
-        away = f'<path d="M{x - 5:.1f} {y - 5:.1f}l10 10m-10 0l10 -10"/>'
-        return f'<g class="look">{ring}{away if nearer < 0 else ""}</g>'
-    tip = np.array([x, y]) + ARROW * looks * (1, -1)
-    back = -7 * looks / np.hypot(*looks) * (1, -1)
-    side = 0.5 * np.array([-back[1], back[0]])
-    ends = [tip + back + side, tip, tip + back - side]
-    head = " ".join(f"{px:.1f},{py:.1f}" for px, py in ends)
-    shaft = f'<line x1="{x:.1f}" y1="{y:.1f}" x2="{tip[0]:.1f}" y2="{tip[1]:.1f}"/>'
-    return f'<g class="look">{shaft}<polyline points="{head}"/></g>'
-
-
-def _ordinates(values_mm: np.ndarray, place_of: Callable[[float], float], *, along: bool) -> list[str]:
-    """The coordinates of places with leaders, along the lower edge or the left one; close ones are drawn apart."""
-    lines, distinct_mm = [], sorted(set(np.round(values_mm, 1).tolist()), key=place_of)
-    places = np.array([place_of(value) for value in distinct_mm])
-    # labels are apart, and keep to the edge as far as there is room
-    end = (WIDTH if along else HEIGHT) - EDGE
+def _labels(values_mm: np.ndarray, drawn: np.ndarray, end: float) -> list[tuple[float, float, float]]:
+    """Each coordinate once with its place along an edge and that of its label; close labels are apart."""
+    places, first = np.unique(drawn, return_index=True)
+    # labels keep to the edge as far as there is room
     apart = min(APART, (end - EDGE / 2) / max(len(places) - 1, 1)) * np.arange(len(places))
-    labels = np.maximum.accumulate(places - apart)
-    labels = np.minimum(labels, end - apart[-1]) + apart
-    for value, at, label in zip(distinct_mm, places, labels, strict=True):
-        text = f"{value + 0.0:.1f}"
-        if along:
-            bottom = HEIGHT - EDGE + 6
-            lines.append(f'<path class="leader" d="M{at:.1f} 30V{bottom - 8:.1f}L{label:.1f} {bottom:.1f}"/>')
-            turn = f'transform="rotate(-90 {label + 3:.1f} {bottom + 4:.1f})"'
-            lines.append(f'<text x="{label + 3:.1f}" y="{bottom + 4:.1f}" text-anchor="end" {turn}>{text}</text>')
-        else:
-            lines += [
-                f'<path class="leader" d="M{WIDTH - 10:.0f} {at:.1f}H{EDGE + 8:.1f}L{EDGE:.1f} {label:.1f}"/>',
-                f'<text x="{EDGE - 3:.1f}" y="{label + 3:.1f}" text-anchor="end">{text}</text>',
-            ]
-    return lines
+    labels = np.minimum(np.maximum.accumulate(places - apart), end - apart[-1]) + apart
+    return list(zip(values_mm[first].tolist(), places.tolist(), labels.tolist(), strict=True))
 
 
-STYLE = """@page { size: A4; margin: 14mm; }
-* { box-sizing: border-box; }
-body { font: 10pt/1.4 system-ui, "Segoe UI", Roboto, Arial, sans-serif; color: #1f2933; max-width: 182mm;
-  margin: 0 auto; padding: 12px; }
-h1 { font-size: 15pt; margin: 0 0 2mm; }
-h2 { font-size: 11.5pt; margin: 5mm 0 1.5mm; break-after: avoid; }
-p { margin: 0 0 2mm; }
-table { border-collapse: collapse; width: 100%; font-size: 8.5pt; font-variant-numeric: tabular-nums;
-  margin-bottom: 1mm; }
-th, td { border: 0.3mm solid #9aa5b1; padding: 0.8mm 1.4mm; text-align: right; vertical-align: top; }
-th { background: #eef1f4; }
-.text { text-align: left; }
-.unknown { color: #a13d00; }
-tr { break-inside: avoid; }
-.views { display: grid; grid-template-columns: 1fr 1fr; gap: 3mm; }
-svg { border: 0.3mm solid #d9dee4; width: 100%; break-inside: avoid; }
-svg text { font-size: 9px; fill: #4a5763; }
-svg .name, svg .title { font-size: 10px; fill: #1f2933; font-weight: 600; }
-svg .look { stroke: #005a8f; fill: none; stroke-width: 1.6; }
-svg .up { stroke: #b36b00; stroke-width: 2; }
-svg .leader { stroke: #b8c1cb; fill: none; stroke-width: 0.6; }
-pre { font: 7pt/1.35 ui-monospace, Menlo, Consolas, monospace; white-space: pre-wrap; overflow-wrap: anywhere;
-  background: #f3f5f8; padding: 2mm; }
-@media print { body { padding: 0; max-width: none; } }
-"""
-POLICY = "default-src 'none'; style-src 'unsafe-inline'"
-ANGLES = (
-    "Azimuth runs from +x towards +y, elevation from the x-y plane towards +z. Roll turns the part about its optical "
-    "axis, right-handed as seen from behind it: at 0 degrees its top points as far up (+z) as it can."
-)
+def _pose(one: MountedPart) -> list[str]:
+    """The place, angles, axes and quaternion of a sensor."""
+    place = [fixed(value, 1) for value in MM_PER_M * one.sensor.origin_m]
+    angles = [fixed(math.degrees(angle), 2) for angle in one.angles_rad]
+    vectors = (one.axes[0], one.axes[2], quaternion(*one.roll_pitch_yaw_rad))
+    return [one.name, *place, *angles, *(" ".join(fixed(value, 4) for value in vector) for vector in vectors)]
 
 
-def _page(design: DesignSpec, mounted: Sequence[MountedPart], frame: str, parent: str) -> str:
-    """The page to print."""
-    title = f"Mounting {design.name}"
-    of_world = "the <b>world's</b> frame: x forward, y to the left, z up"
-    of_robot = f"the frame of <b>{html.escape(frame)}</b>, as the robot's model has it"
-    views = "".join(_sketch(mounted, *view) for view in VIEWS)
-    commands = html.escape("\n".join(_transforms(mounted, parent)))
-    body = [
-        f"<p>{len(mounted)} {'sensor' if len(mounted) == 1 else 'sensors'}. Places and directions are in "
-        f"{of_world if design.mount is None else of_robot}. Numbers are rounded; "
-        "<code>mounts.csv</code> has all digits. No design of this program has been built in hardware yet.</p>",
-        "<h2>Where, and which way</h2>", _poses(mounted), f"<p>{ANGLES}</p>",
-        '<div class="views">', views, "</div>",
-        "<p>Squares: sensors. Blue: the optical axis, as a ring where it points at you, with a cross where it points "
-        "away. Orange: the part's top. Each view has its own scale.</p>",
-        "<h2>What</h2>", _parts_table(mounted), *_before_drilling(mounted),
-        "<h2>In ROS 2</h2>",
-        f"<p><code>mounts.urdf</code> has a fixed joint for each; or publish the frames:</p><pre>{commands}</pre>",
-    ]  # fmt: skip
-    return (
-        f'<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{html.escape(title)}</title>\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n<style>{STYLE}</style>\n</head>\n<body>\n'
-        f"<h1>{html.escape(title)}</h1>\n{''.join(body)}\n</body>\n</html>\n"
-    )
+def _part(one: MountedPart) -> list[str]:
+    """What a sensor is, and what is known of how it is mounted."""
+    ends = one.field_deg
+    field = ", ".join(f"{low:.4g} to {high:.4g}" for low, high in ends)
+    if all(low == -high for low, high in ends):
+        field = " x ".join(f"{high - low:.4g}" for low, high in ends)
+    gate = " to ".join(f"{end:.3f}" for end in one.sensor.gate_m)
+    reach = UNKNOWN if one.part is None else next(iter(reach_of(one.part).as_text().values()))
+    stated = [reach, *(one.stated(name) for name in ("up", "zone_0", "origin"))]
+    figures = [f"{value:g}" if (value := one.figure(name)) != "" else UNKNOWN for name in ("power_w", "price")]
+    return [one.name, one.sensor.part or "none: programmable", one.pattern, field, gate, *stated, *figures]
 
 
-def _poses(mounted: Sequence[MountedPart]) -> str:
-    """The places, angles, axes and quaternions of all sensors as a table."""
-    headings = ("sensor", "x", "y", "z", "azimuth", "elevation", "roll", "axis (x y z)", "top (x y z)", "q (w x y z)")
-    rows = []
-    for one in mounted:
-        place = [f"{value + 0.0:.1f}" for value in np.round(MM_PER_M * one.sensor.origin_m, 1)]
-        angles = [f"{round(math.degrees(angle), 2) + 0.0:.2f}" for angle in one.angles_rad]
-        vectors = [one.axes[0], one.axes[2], quaternion(*one.roll_pitch_yaw_rad)]
-        numbers = [" ".join(f"{value + 0.0:.4f}" for value in np.round(vector, 4)) for vector in vectors]
-        rows.append([one.name, *place, *angles, *numbers])
-    return _table(headings, rows, "Places in mm, angles in degrees.", text=(0,))
-
-
-def _parts_table(mounted: Sequence[MountedPart]) -> str:
-    """What each sensor is, and what is known of how it is mounted, with the sums of power and price."""
-    headings = (
-        "sensor", "part", "fires", "field of view [deg]", "gate [m]", "reach in the dark / sun [m]", "which side is up",
-        "first zone looks", "rays start at", "power [W]", "price",
-    )  # fmt: skip
-    rows = []
-    for one in mounted:
-        ends = one.field_deg
-        field = ", ".join(f"{low:.4g} to {high:.4g}" for low, high in ends)
-        if all(low == -high for low, high in ends):
-            field = " x ".join(f"{high - low:.4g}" for low, high in ends)
-        gate = " to ".join(f"{end:.3f}" for end in one.sensor.gate_m)
-        reach = UNKNOWN if one.part is None else next(iter(reach_of(one.part).as_text().values()))
-        stated = [reach, *(one.stated(name) for name in ("up", "zone_0", "origin"))]
-        figures = [f"{value:g}" if (value := one.figure(name)) != "" else UNKNOWN for name in ("power_w", "price")]
-        rows.append([one.name, one.sensor.part or "none: programmable", one.pattern, field, gate, *stated, *figures])
-    totals = []
-    for name, unit in (("power_w", " W"), ("price", "")):
-        values = [one.figure(name) for one in mounted]
-        known = [value for value in values if value != ""]
-        totals.append(
-            f"{sum(known):.6g}{unit}" + f", without {len(values) - len(known)}" * (len(known) < len(values))
-            if known
-            else UNKNOWN
-        )
-    rows.append(["in all", *[""] * 8, *totals])
-    return _table(
-        headings,
-        rows,
-        "Fields of view are about the optical axis: width x height, or right to left and lower to upper end.",
-        (0, 1, 2, 6, 7, 8),
-    )
-
-
-def _before_drilling(mounted: Sequence[MountedPart]) -> list[str]:
-    """What has to be found out before holes are drilled."""
-    questions = [
-        ("which side is up", "up"),
-        ("where rays start on the part", "origin"),
-        ("where the first zone looks", "zone_0"),
-    ]
-    missing = [text for text, name in questions if any(one.stated(name) == UNKNOWN for one in mounted)]
-    found = []
-    if missing and any(one.sensor.part is not None for one in mounted):
-        found.append(f"<p><b>Before you drill</b>, find out for each part marked unknown: {'; '.join(missing)}.</p>")
-    if any("unverified" in one.stated("zone_0") for one in mounted):
-        found.append("<p>Confirm the first zone with a hand in one corner of the field.</p>")
-    return found
-
-
-def _table(headings: Sequence[str], rows: Sequence[Sequence[str]], caption: str, text: Sequence[int]) -> str:
-    def cell(number: int, value: str, tag: str) -> str:
-        kinds = [name for name, holds in (("text", number in text), ("unknown", UNKNOWN in value)) if holds]
-        return f'<{tag} class="{" ".join(kinds)}">{html.escape(value)}</{tag}>'
-
-    head = "".join(cell(number, value, "th") for number, value in enumerate(headings))
-    lines = ["".join(cell(number, value, "td") for number, value in enumerate(row)) for row in rows]
-    body = "</tr><tr>".join(lines)
-    return f"<table><thead><tr>{head}</tr></thead><tbody><tr>{body}</tr></tbody></table><p>{caption}</p>"
+def _total(mounted: Sequence[MountedPart], name: str, unit: str = "") -> str:
+    """The sum of a figure over all sensors, and how many have none."""
+    known = [value for one in mounted if (value := one.figure(name)) != ""]
+    left_out = f", without {len(mounted) - len(known)}" if len(known) < len(mounted) else ""
+    return f"{sum(known):.6g}{unit}{left_out}" if known else UNKNOWN

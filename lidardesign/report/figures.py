@@ -6,6 +6,7 @@ switched from the keyboard too.
 
 from __future__ import annotations
 
+import base64
 import html
 import math
 from collections.abc import Collection, Mapping, Sequence
@@ -17,7 +18,6 @@ import numpy as np
 from lidardesign.errors import check_choice
 from lidardesign.evaluation.results import Evaluation, Row
 from lidardesign.report.density_views import Marginal, PlaneDensity
-from lidardesign.report.markup import encoded
 from lidardesign.report.scene_figure import frustum_lines
 from lidardesign.scenes.rays import Outcome, Rays
 from lidardesign.sensors.design import DesignSpec
@@ -300,6 +300,11 @@ def plane_figure(plane: PlaneDensity) -> dict[str, Any]:
         },
     }  # fmt: skip
     return {"data": [heat, *outlines], "layout": layout}
+
+
+def encoded(values: np.ndarray, kind: str) -> str:
+    """An array as base64 of its little-endian bytes, row by row."""
+    return base64.b64encode(np.ascontiguousarray(values, dtype=kind).tobytes()).decode("ascii")
 
 
 def _array(values: np.ndarray) -> dict[str, str]:

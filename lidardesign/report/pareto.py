@@ -14,8 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from lidardesign.report.figures import LAYOUT
-from lidardesign.report.markup import folded
-from lidardesign.report.tables import plain_number, table
+from lidardesign.run.markup import rendered
 from lidardesign.scoring.sweep import Measurement, Sweep
 
 # Axes span at least so many times their smallest value, and end so far beyond what they show.
@@ -287,34 +286,6 @@ def _tolerance(panel: Panel) -> dict[str, Any]:
     }
 
 
-def accuracy_tables(sweeps: Sequence[Sweep]) -> str:
-    """A table of each sweep with all its measurements, an explanation and its verdict."""
-    return "".join(_table(sweep) for sweep in sweeps)
-
-
-def _table(sweep: Sweep) -> str:
-    unit = f" [{sweep.unit}]" if sweep.unit else ""
-    limit = f"{sweep.tolerance:.3g} {sweep.unit}".rstrip()
-    about = (
-        f"Error: {sweep.error_of}, against {sweep.against}. Tolerance: {limit}, {sweep.because}. Seconds: "
-        f"{sweep.work}." + (f" Note: {sweep.note}." if sweep.note else "")
-    )
-    headings = ("setting", f"error{unit}", "standard error", "seconds", "MB", "verdict")
-    chosen = sweep.chosen
-    lines = [(_cells(one), "better" if one is chosen else "open", False) for one in sweep.measurements]
-    words = {"better": "to choose", "open": ""}
-    content = table(headings, lines, text_columns=1, words=words, caption=f"Settings of {sweep.knob}.")
-    return folded(f"{sweep.knob}: {sweep.verdict}", f"<p>{html.escape(about)}</p>{content}")
-
-
-def _cells(measurement: Measurement) -> list[str]:
-    size = measurement.memory_bytes
-    memory = "" if size is None else plain_number(size / BYTES_PER_MB, 3, tiny=1.0)
-    error = (f"{measurement.error:.3g}", f"{measurement.uncertainty:.2g}")
-    return [
-        measurement.setting + (" (run)" if measurement.default else ""),
-        *(("reference", "") if measurement.reference else error),
-        f"{measurement.seconds:.3g}",
-        memory,
-        "",
-    ]
+def accuracy_section(sweeps: Sequence[Sweep]) -> str:
+    """The pictures, and a table of each sweep with all its measurements, an explanation and its verdict."""
+    return rendered("report/templates/accuracy.html", sweeps=sweeps, figures=pareto_figures(sweeps))

@@ -8,8 +8,6 @@ are switched on.
 
 from __future__ import annotations
 
-import html
-import json
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -17,8 +15,7 @@ from typing import Any
 import numpy as np
 
 from lidardesign.numerics import EPSILON_FLOAT32
-from lidardesign.report.figures import OUTCOME_WORDS, Series
-from lidardesign.report.markup import embedded, encoded, swatch, switch
+from lidardesign.report.figures import OUTCOME_WORDS, Series, encoded
 from lidardesign.report.scene_figure import (
     MOST_FACES,
     PATTERN,
@@ -32,6 +29,7 @@ from lidardesign.report.scene_figure import (
     round_steps,
     scene_bounds,
 )
+from lidardesign.run.markup import rendered
 from lidardesign.scenes.rays import Outcome
 from lidardesign.scenes.scene import Body, Mesh, Scene
 from lidardesign.scenes.surface import half_extents_m
@@ -171,7 +169,6 @@ def _design(one: DrawnDesign, look: Series) -> dict[str, Any]:
     few = len(one.design.sensors) <= MOST_SENSORS
     cones = [[_cone(sensor, design.level) for sensor in design.sensors] for design in one.placed] if few else []
     return {
-        "name": html.escape(one.design.name),
         "colour": look.colour,
         "dash": look.dash,
         "sensors": len(one.design.sensors) if few else 0,
@@ -196,58 +193,22 @@ def _cone(sensor: Sensor, level: float) -> np.ndarray:
     )
 
 
-CAMERA = (
-    ("left", "Turn left"),
-    ("right", "Turn right"),
-    ("up", "Higher"),
-    ("down", "Lower"),
-    ("closer", "Closer"),
-    ("farther", "Farther"),
-    ("above", "From above"),
-    ("reset", "First view"),
-)
-
-OF_SOLID = ("up", "down", "above")
-
-
 def view_section(shown: SceneFigure, looks: Sequence[Series], density_m: np.ndarray | None) -> str:
     """The HTML section of the view; `looks` are the designs' styles, `density_m` (K, 3) observed points [m]."""
-    # a world in a plane is always seen from above
-    left_out = OF_SOLID if is_flat(shown.directions) else ()
-    buttons = "".join(
-        f'<button type="button" data-camera="{how}">{word}</button>' for how, word in CAMERA if how not in left_out
-    )
-    stage = (
-        '<div class="stage"><div id="view-scene" tabindex="0" role="application" '
-        'title="Drag to turn, with Shift to move. Click, then scroll to go closer." aria-label="3D view of the scene. '
-        'Arrow keys turn it, plus and minus go closer and farther, Home shows the first view."><canvas></canvas></div>'
-        '<img id="view-printed" alt="The 3D view as it stood when the page was printed">'
-        f'<div class="buttons" role="group" aria-label="Camera">{buttons}'
-        '<button type="button" id="view-save">Save picture</button></div></div>'
-    )
-    # one switch per outcome that any ray has, with the look of its rays and how many are drawn
     there = {int(code) for one in shown.designs for code in np.unique(one.outcome)} | {int(Outcome.RETURN)}
-    switches = "".join(
-        switch(name, picture=swatch(colour, dash, symbol), count=str(int(code)), outcome=str(int(code)))
-        for code, name, colour, dash, symbol in OUTCOMES
-        if int(code) in there
-    )
-    layers = [switch("scene", picture=swatch("#c9b8a8", None), layer="scene")]
-    if not all(body.is_target for body in shown.scene.bodies):
-        layers.append(switch("occluders", picture=swatch("#6b7280", None), layer="occluders"))
-    layers += [switch("fields of view", layer="fields"), switch("gates", layer="gates")]
-    layers += [switch("where rays start", layer="starts")]
-    if density_m is not None:
-        dots = swatch("#7b2d8b", "dot")
-        layers.append(switch("what the learned density observes", picture=dots, checked=False, layer="density"))
-    groups = (_group("Rays", switches), _group("Shown", "".join(layers)), _designs(shown, looks))
-    controls = _sliders(shown) + "".join(groups)
-    data = embedded(view_document(shown, looks, density_m), id="view-data")
-    return (
-        f"{''.join(f'<p>{html.escape(text)}</p>' for text in view_notes(shown))}"
-        f'<noscript><p class="note">The view needs JavaScript; all figures stand in the tables too.</p></noscript>'
-        f'<div class="view">{stage}<div class="controls" role="group" aria-label="What is shown">{controls}</div></div>'
-        f'<p id="view-status" role="status" aria-live="polite"></p>{data}'
+    designs = [one.design for one in shown.designs]
+    rays = [np.bincount(one.rays[0].sensor, minlength=len(one.design.sensors)).tolist() for one in shown.designs]
+    return rendered(
+        "report/templates/scene.html",
+        notes=view_notes(shown),
+        is_flat=is_flat(shown.directions),
+        sliders=_sliders(shown),
+        outcomes=[(int(code), *look) for code, *look in OUTCOMES if int(code) in there],
+        has_occluders=not all(body.is_target for body in shown.scene.bodies),
+        has_density=density_m is not None,
+        designs=list(zip(designs, looks, rays, strict=True)),
+        most_sensors=MOST_SENSORS,
+        document=view_document(shown, looks, density_m),
     )
 
 
@@ -288,53 +249,11 @@ def _runs(patterns: Sequence[int], scene: Scene) -> str:
     return f"patterns {shown}{', ...' if len(begins) > MOST_RUNS else ''}"
 
 
-def _sliders(shown: SceneFigure) -> str:
+def _sliders(shown: SceneFigure) -> list[tuple[str, str, list[str]]]:
+    """The sliders over positions and frames: what they are of, their titles, and a label for each step."""
     names = " and ".join(shown.places[0]) or "position"
     along = "Pattern" if names == PATTERN else f"Position: {names}"
     places = [", ".join(f"{name} = {value:.4g}" for name, value in place.items()) for place in shown.places]
     rate_hz, count = shown.scene.frame_rate_hz, shown.scene.frames
     frames = [f"frame {frame + 1} of {count}, {frame / rate_hz:.2f} s" for frame in shown.frames]
-    sliders = ""
-    for step, title, labels in (("place", along, places), ("frame", "Time", frames)):
-        if len(labels) > 1:
-            sliders += (
-                f'<div class="slider"><label for="view-{step}">{html.escape(title)}</label>'
-                f'<output for="view-{step}"></output><input type="range" id="view-{step}" data-step="{step}" min="0" '
-                f'max="{len(labels) - 1}" step="1" value="{len(labels) // 2}" '
-                f'data-labels="{html.escape(json.dumps(labels))}"></div>'
-            )
-    return sliders
-
-
-def _designs(shown: SceneFigure, looks: Sequence[Series]) -> str:
-    parts = ""
-    for number, (one, look) in enumerate(zip(shown.designs, looks, strict=True)):
-        picture = swatch(look.colour, look.dash)
-        parts += switch(one.design.name, picture=picture, checked=number == 0, design=str(number))
-        parts += _sensors(one, number)
-    return _group("Designs", parts) if parts else ""
-
-
-def _sensors(one: DrawnDesign, number: int) -> str:
-    sensors, name = one.design.sensors, html.escape(one.design.name)
-    if len(sensors) > MOST_SENSORS:
-        return f'<p class="sensors">{len(sensors)} sensors, drawn by their rays</p>'
-    rays = np.bincount(one.rays[0].sensor, minlength=len(sensors))
-    rows = "".join(
-        switch(f"{sensor.name}: {count} {'ray' if count == 1 else 'rays'}", sensor=f"{number}.{index}")
-        for index, (sensor, count) in enumerate(zip(sensors, rays, strict=False))
-    )
-    buttons = "".join(
-        f'<button type="button" data-every="{number}" data-to="{to}" aria-label="{label} sensors of {name}">{label}'
-        "</button>"
-        for to, label in (("on", "All"), ("off", "None"))
-    )
-    return (
-        f'<details class="sensors"{" open" if number == 0 and len(sensors) <= 12 else ""}>'
-        f"<summary>{len(sensors)} {'sensor' if len(sensors) == 1 else 'sensors'} of {name}</summary>"
-        f'<div class="buttons">{buttons}</div>{rows}</details>'
-    )
-
-
-def _group(title: str, content: str) -> str:
-    return f"<fieldset><legend>{html.escape(title)}</legend>{content}</fieldset>"
+    return [("place", along, places), ("frame", "Time", frames)]

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import asyncio
+from collections import Counter
 from collections.abc import Callable, Sequence
-from html import escape
 from typing import Any
 
 import viser
 
 from lidardesign.constraints.document import SensorConstraints
 from lidardesign.formats import FORMATS
+from lidardesign.report.figures import OUTCOME_WORDS
+from lidardesign.run.markup import rendered
 from lidardesign.studio.choices import EVERY, MOUNT, Choices, SensorPose, constraint_keys, key_label
+from lidardesign.studio.stage import COLOURS
 
 NONE, ANY = "nothing", "sensors of any shape"
 STEPS = ("Undo", "Redo", "Fit", "Stop", "Score")
@@ -80,14 +83,11 @@ class ControlPanel:
 
     def say_status(self, lines: Sequence[str]) -> None:
         """Show what the design is and what it is worth."""
-        self._status.content = _box(
-            "7.6em",
-            "<br>".join([f"<b>{escape(line)}</b>" for line in lines[:1]] + [escape(line) for line in lines[1:]]),
-        )
+        self._status.content = _box(7.6, "".join(f"\n{line}" for line in lines[1:]), "".join(lines[:1]))
 
     def say(self, text: str, *, is_wrong: bool = False) -> None:
         """Show what is under way, or went wrong."""
-        self._working.content = _box("4.6em", escape(text), "#b42318" if is_wrong else "#475467")
+        self._working.content = _box(4.6, text, colour="#b42318" if is_wrong else "#475467")
 
     def _input(self, control: Any, wish: str, key: str | None = None, *, waits: bool = False) -> Any:
         """A control whose changes by a user are wishes; those by the program are not.
@@ -132,7 +132,7 @@ class ControlPanel:
             self._input(gui.add_slider(name, min=0, max=1, step=1, initial_value=0), "look", name)
             for name in ("scene", "frame")
         )
-        self.outcomes = gui.add_html("")
+        self._outcomes = gui.add_html("")
         with gui.add_folder("shown"):
             for name in LAYERS:
                 self._input(gui.add_checkbox(name, initial_value=name not in (DENSITY, BLIND)), "layer", name)
@@ -171,7 +171,7 @@ class ControlPanel:
         gui = self.gui
         self.name = self._input(gui.add_text("name", initial_value="studio"), "name", waits=True)
         self._input(gui.add_button("Save the design and its constraints"), "save")
-        self._saved = gui.add_html(_box("4em", ""))
+        self._saved = gui.add_html(_box(4, ""))
         self.command = gui.add_text("the same from a shell", initial_value="", multiline=True)
         self.format = self._input(gui.add_dropdown("export as", ["choose a format", *FORMATS.names()]), "export")
         self._input(gui.add_button("Mounting page"), "mounts")
@@ -212,20 +212,24 @@ class ControlPanel:
         self.free.disabled = not is_sensor or not choices.fixed(name)
         if pose is None:
             text = "Choose a sensor, or click its ball in the view; in training scenes it can be moved."
-            self._where.content = _box("2.6em", text)
+            self._where.content = _box(2.6, text)
             return
         words = {"origin": "place", "boresight": "direction"}
         fixed = " and ".join(words[key] for key in choices.fixed(name)) if is_sensor else "place"
         kept = f"fixed: {fixed}" if fixed else "the next fit may place it elsewhere"
-        self._where.content = _box(
-            "2.6em", f"<b>{escape(name)}</b> in {escape(choices.design.specification.frame)}; {kept}"
-        )
+        self._where.content = _box(2.6, f" in {choices.design.specification.frame}; {kept}", name)
         self._give(self.place, ", ".join(map(str, pose.place_m)))
         self._give(self.angles, ", ".join(map(str, pose.angles_deg)))
 
+    def show_outcomes(self, codes: Sequence[int]) -> None:
+        """Show how many rays come to which end, from the code of each."""
+        counts = Counter(codes)
+        outcomes = [(COLOURS[int(code)], counts[int(code)], word) for code, word in OUTCOME_WORDS.items()]
+        self._outcomes.content = str(rendered("studio/templates/outcomes.html", rays=len(codes), outcomes=outcomes))
+
     def say_saved(self, text: str) -> None:
         """Show what was written."""
-        self._saved.content = _box("4em", escape(text))
+        self._saved.content = _box(4, text)
 
     def add_design(self, name: str) -> None:
         """Offer a design that was saved."""
@@ -234,7 +238,7 @@ class ControlPanel:
 
     def show_scores(self, text: str, figure: Any) -> None:
         """Show scores on held-out scenes, with their curves."""
-        self.scores.content = text
+        self.scores.content = str(text)  # viser sends no subclass of str
         if self.curves is None:
             with self._scores_tab:
                 self.curves = self.gui.add_plotly(figure, aspect=1.2)
@@ -242,7 +246,7 @@ class ControlPanel:
             self.curves.figure = figure
 
 
-def _box(height: str, text: str, colour: str = "inherit") -> str:
-    """A text of fixed height, so that the controls below it stay where they are."""
-    style = "overflow: auto; white-space: pre-wrap; font-size: 0.85em; line-height: 1.25em; padding: 0 1em"
-    return f'<div style="{style}; height: {height}; color: {colour}">{text}</div>'
+def _box(height_em: float, text: str, title: str = "", colour: str = "inherit") -> str:
+    """A text of fixed height behind a bold title, so that the controls below it stay where they are."""
+    box = rendered("studio/templates/box.html", height_em=height_em, text=text, title=title, colour=colour)
+    return str(box)  # viser sends no subclass of str

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import threading
-from collections import Counter
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache, lru_cache, partial
-from html import escape
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
@@ -25,8 +23,8 @@ from lidardesign.fitting.options import check_name
 from lidardesign.formats import FORMATS
 from lidardesign.parts.catalogue import load_library
 from lidardesign.rays.training_scenes import TrainingScenes
-from lidardesign.report.figures import OUTCOME_WORDS
 from lidardesign.run.manifest import locked_run, write_recorded
+from lidardesign.run.markup import rendered
 from lidardesign.run.yaml import dump_yaml
 from lidardesign.run_folder import ignore
 from lidardesign.samples import load_samples
@@ -39,12 +37,11 @@ from lidardesign.space import observed_point
 from lidardesign.studio.choices import EVERY, MOUNT, Choices, SensorPose
 from lidardesign.studio.panel import BLIND, DENSITY, LAYERS, LIGHTS, NONE, SPLITS, STEPS, ControlPanel
 from lidardesign.studio.server import Worker, start_server, stop_server
-from lidardesign.studio.stage import BESIDE, COLOURS, Stage
+from lidardesign.studio.stage import BESIDE, Stage
 from lidardesign.task import Metric, random_generator
 
 DENSITY_POINTS = 3000
 MOST_UNDONE = 100
-ABOUT_BASELINES = "Baselines fire as many rays, each wherever it likes: no part or limit holds for them."
 PURPOSE = "comparison"  # of the stream of training scenes: fits choose and hold back scenes of other streams
 SCENES = 20
 MOST_KEPT = 100  # designs whose scores are known
@@ -112,7 +109,7 @@ class Studio:
         self._ended.get()
 
     def _repr_html_(self) -> str:
-        return f'<iframe src="{escape(self.address)}" width="100%" height="700" style="border:0"></iframe>'
+        return rendered("studio/templates/frame.html", address=self.address)
 
     def wish(self, name: str, value: Any = None) -> None:
         """Do what a user asks for on the page: the name of a wish, and its value."""
@@ -172,13 +169,7 @@ class Studio:
             beside = self._seen(self._beside, choices, detector)
             self._stage.show_seen(beside.scene, beside.returns[min(choices.frame, len(beside.returns) - 1)], BESIDE)
             self._stage.show_sensors(self._beside.specification.sensors, None, BESIDE)
-        counts = Counter(one.outcome.tolist())
-        words = [
-            f'<span style="color:rgb{COLOURS[int(code)]}">&#9632;</span> {counts[int(code)]} {word}'
-            for code, word in OUTCOME_WORDS.items()
-            if counts[int(code)]
-        ]
-        self._panel.outcomes.content = f"{len(one.rays)} rays: {', '.join(words)}"
+        self._panel.show_outcomes(one.outcome.tolist())
 
     def _show_controls(self) -> None:
         # a fit may leave fewer sensors
@@ -396,16 +387,9 @@ class Studio:
 
     def _show_scores(self, scores: Scores) -> None:
         metric = self.run.metric
-        rows = "\n".join(
-            f"| {escape(row.design)} | {row.rays} | {row.bandwidth_mbps:.3g} | "
-            f"{_figure(Interval(row.value, row.ci_low, row.ci_high), '')} |"
-            for row in scores.rows
-        )
-        text = (
-            f"{scores.evaluation.scenes} **held-out** scenes, which nothing was chosen on; {metric.better} is better."
-        )
-        heading = f"| | rays | Mbit/s | {metric.name} [{metric.unit}] |\n|---|---|---|---|"
-        self._panel.show_scores(f"{text}\n\n{heading}\n{rows}\n\n{ABOUT_BASELINES}", scores.figure("bandwidth"))
+        rows = [(row, _figure(Interval(row.value, row.ci_low, row.ci_high), "")) for row in scores.rows]
+        text = rendered("studio/templates/scores.md", scenes=scores.evaluation.scenes, metric=metric, rows=rows)
+        self._panel.show_scores(text, scores.figure("bandwidth"))
         row = scores.rows[0]
         value = _figure(Interval(row.value, row.ci_low, row.ci_high), metric.unit)
         self._panel.say(f"{row.design}: {value} on held-out scenes; the tab Scores has the baselines")

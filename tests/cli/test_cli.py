@@ -23,7 +23,7 @@ from lidardesign.cli.terminal.design_tables import show_fit
 from lidardesign.cli.terminal.output import command, plain_json
 from lidardesign.errors import InfeasibleError
 from lidardesign.parts.catalogue import Pose, find_part, part_design
-from lidardesign.report.tables import sensors_table
+from lidardesign.report.sections import sensors_section
 from lidardesign.run.processes import TerminatedError
 from lidardesign.run.yaml import load_yaml
 from lidardesign.sensors.compare import difference, paired_sensors
@@ -168,7 +168,7 @@ def test_wherever_a_sensor_looks_its_roll_part_and_frame_are_said(lidardesign, t
     console = Console(file=io.StringIO(), width=120)
     show_fit({"error_estimates": {}}, design, [], console, verbose=False)
     shown = lidardesign("show", tmp_path / "turned.yaml").out
-    pages = [html.unescape(page) for page in (sensors_table(design), Design(design)._repr_html_())]
+    pages = [html.unescape(page) for page in (sensors_section([design]), Design(design)._repr_html_())]
     for text in (shown, console.file.getvalue(), *pages):
         for word in ("roll", "90.00", PART, frame):
             assert word in text

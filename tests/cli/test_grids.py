@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from lidardesign.cli.terminal.grids import duration, print_table
-from lidardesign.report.tables import plain_number
+from lidardesign.run.markup import plain_number
 
 HEADINGS = ("design", "rays", "difference (95 % interval)", "seconds")
 LINES = (["free", "196", "-0.013 (-0.021 to -0.004)", "1.4, 2.6"], ["(own)", "36", "0.002 (-0.010 to 0.012)", "3, 3"])

@@ -15,7 +15,10 @@ import lidardesign
 
 # scipy by itself takes four milliseconds, and its parts come when they are used
 PARTS = [f"scipy.{part}" for part in ("linalg", "optimize", "sparse", "spatial", "special", "stats")]
-HEAVY = ["torch", "zuko", "numba", *PARTS, "trimesh", "igl", "embreex", "h5py", "matplotlib", "plotly", "numpy.f2py"]
+HEAVY = [
+    "torch", "zuko", "numba", *PARTS, "trimesh", "igl", "embreex", "h5py", "matplotlib", "plotly",
+    "jinja2", "numpy.f2py",
+]  # fmt: skip
 NUMERIC = ["numpy", "yaml"]
 
 

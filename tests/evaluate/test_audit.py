@@ -15,7 +15,7 @@ from lidardesign.api.run import open_run
 from lidardesign.evaluation.entries import effect_notes, effect_summaries
 from lidardesign.evaluation.results import Audit, AuditRow
 from lidardesign.evaluation.score import evaluate
-from lidardesign.report.tables import audit_section, effects_section
+from lidardesign.report.sections import audit_section, effects_section
 from lidardesign.scenes.scene import Ambient, Scene
 from lidardesign.simulate import plan as plan_module
 from lidardesign.simulate.detector.physics import EFFECTS, IDEAL, Detector
@@ -133,7 +133,7 @@ def test_documents_hold_effects_and_audits_as_plain_json():
 def test_the_report_shows_effects_and_audit_and_escapes_names():
     request = make_request(test=sunny(1), planner=Planner(replace(SINGLE, name="<b>x</b>")), audit=True, rays=(9,))
     evaluation = evaluate(request)
-    page = effects_section(evaluation) + audit_section(evaluation, evaluation.audit)
+    page = effects_section(evaluation) + audit_section(evaluation)
     assert "The audit passed." in page
     assert "100,000 lux (sun)" in page
     assert "<b>x</b>" not in page

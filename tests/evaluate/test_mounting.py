@@ -18,7 +18,7 @@ from lidardesign.estimates import paired_difference
 from lidardesign.evaluation.mounting import MountError
 from lidardesign.evaluation.score import evaluate
 from lidardesign.evaluation.seeds import over_seeds
-from lidardesign.report.tables import mounting_table
+from lidardesign.report.sections import mounting_section
 
 DEGREE = math.pi / 180
 ERROR = MountError(0.005, 0.5 * DEGREE)
@@ -117,9 +117,9 @@ def test_every_row_stands_beside_itself_mounted_exactly():
     # an aimed pencil of rays suffers; rays in all directions do not mind
     costs = {(cost.a, cost.rays): cost.difference for cost in mounting.costs}
     assert costs["aimed", 25] > abs(costs["random", 25])
-    page = mounting_table(evaluation)
+    page = mounting_section(evaluation)
     assert "0 mm and 3 degrees" in page
-    assert not mounting_table(exact)
+    assert not mounting_section(exact)
 
 
 def test_over_seeds_rows_and_costs_are_means():

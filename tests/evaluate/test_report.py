@@ -7,6 +7,7 @@ from html.parser import HTMLParser
 import numpy as np
 import plotly.graph_objects as go
 import pytest
+from jinja2 import UndefinedError
 from support.references import shape_distance
 from support.report_pages import (
     FRAMES,
@@ -24,8 +25,7 @@ from support.report_pages import (
 from lidardesign.evaluation.entries import StrongestBaseline
 from lidardesign.evaluation.results import Evaluation, leading_detail, verdict
 from lidardesign.report.figures import curve_figure, far_baselines, marginal_figure, plane_figure, series
-from lidardesign.report.markup import asset
-from lidardesign.report.page import report_html
+from lidardesign.report.page import asset, report_html
 from lidardesign.report.scene_figure import (
     FEWEST_STEPS,
     MOST_FACES,
@@ -41,8 +41,9 @@ from lidardesign.report.scene_figure import (
     round_steps,
     thinned,
 )
-from lidardesign.report.tables import CommandTimes, constraints_table, rows_table, times_tables
+from lidardesign.report.sections import CommandTimes, constraints_section, scores_section, times_section
 from lidardesign.report.view import MOST_BODIES, MOST_SENSORS, drawn_bodies, view_bounds, view_document, view_notes
+from lidardesign.run.markup import rendered
 from lidardesign.scenes.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Scene, Sphere, rigid
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.task import Metric
@@ -99,6 +100,11 @@ def test_the_page_repeats_byte_for_byte_and_every_link_has_its_place(plain):
     assert {"view-scene", "curve-rays", *figures} <= set(identifiers)
 
 
+def test_a_value_that_a_template_misses_is_an_error():
+    with pytest.raises(UndefinedError, match="caption"):
+        rendered("api/templates/table.html", headings=(), rows=())
+
+
 def test_every_switch_has_a_label_and_every_table_a_caption_and_scopes(plain):
     body = plain[plain.index("<body>") : plain.index("<script>")]
     boxes = body.count('type="checkbox"')
@@ -151,18 +157,18 @@ def test_bars_of_constraints_are_full_at_the_bound_and_half_in_the_middle():
     report = make_report()
     (tight,) = report.constraints["plain"]
     full, half = replace(tight, room=0.0, share=0.0, tight=2), replace(tight, room=0.4, share=0.5, tight=0)
-    text = constraints_table("d", [full, half])
+    text = constraints_section({"d": [full, half]})
     assert 'class="room full" role="img" aria-label="100 % used"' in text
     assert 'aria-label="50 % used"' in text
     assert "2 of 2" in text
-    assert "no constraints" in constraints_table("<d>", [])
+    assert "no constraints" in constraints_section({"<d>": []})
 
 
 def test_phases_add_up_and_small_ones_count_as_other():
     phases = {"learning": 60.0, "learning/target": 40.0, "tiny": 0.1, "writing": 39.0, "other": 0.9}
     one = CommandTimes("learn", "", phases)
     assert one.seconds == pytest.approx(100.0)
-    text = times_tables([one, CommandTimes("nothing", "", {})])
+    text = times_section([one, CommandTimes("nothing", "", {})])
     shown = [float(value) for value in re.findall(r"</th><td>([0-9.]+)</td>", text)]
     assert shown == [60.0, 40.0, 39.0, 1.0]
     assert not re.search("tiny|nothing", text)
@@ -344,4 +350,4 @@ def test_the_tasks_first_further_figure_stands_beside_the_score():
     assert leading_detail(evaluation.rows) is None
     tracked = [replace(row, details={"tracked_share": 0.8125, "other": 3.0}) for row in evaluation.rows]
     assert leading_detail(tracked) == "tracked_share"
-    assert "0.8125" in rows_table(replace(evaluation, rows=tracked))
+    assert "0.8125" in scores_section(replace(evaluation, rows=tracked))

@@ -11,7 +11,7 @@ import pytest
 from support.report_pages import NASTY, make_row, make_sensor
 
 from lidardesign.evaluation.results import Evaluation
-from lidardesign.report.choice import choice_section, correlation_sentence
+from lidardesign.report.choice import choice_section, rank_correlation
 from lidardesign.report.figures import series
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.task import Metric
@@ -79,7 +79,7 @@ def test_one_is_said_where_proxy_and_score_order_alike(better, scores, correlati
 
 @pytest.mark.parametrize("pairs", [[], [(1, 1), (2, 2), (3, 3)], [(1, 1)] * 4, [(1, n) for n in range(4)]])
 def test_of_too_few_or_equal_choices_no_correlation_is_said(pairs):
-    assert correlation_sentence(pairs, evaluation_of(SCORES)) == ""
+    assert rank_correlation(pairs, evaluation_of(SCORES)) is None
 
 
 @pytest.mark.parametrize("curve", [None, "a", [1, 2], [[1.0]], [[1.0, float("nan")]]])

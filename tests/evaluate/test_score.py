@@ -16,7 +16,7 @@ from lidardesign.evaluation.results import csv_text, verdict
 from lidardesign.evaluation.score import evaluate
 from lidardesign.methods import laid_out
 from lidardesign.report.figures import scores_figure
-from lidardesign.report.tables import paired_tables
+from lidardesign.report.sections import scores_section
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import rigid
 from lidardesign.scoring.scene_scores import silent_notes
@@ -192,7 +192,7 @@ def test_scenes_of_one_group_give_no_interval_and_no_verdict():
         show_evaluation(document, evaluation, console, verbose=verbose)
     assert "None" not in console.file.getvalue()
     assert "over other scenes" not in console.file.getvalue()
-    assert paired_tables(evaluation)
+    assert scores_section(evaluation)
     assert scores_figure(evaluation, "rays")
 
 

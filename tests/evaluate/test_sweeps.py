@@ -12,7 +12,7 @@ from lidardesign.report.pareto import (
     BELOW_PX,
     LINE_PX,
     PANEL_PX,
-    accuracy_tables,
+    accuracy_section,
     label_places,
     panels,
     pareto_figures,
@@ -84,7 +84,7 @@ def test_ladders_of_one_rung_have_tables_and_no_panel():
     single = make_sweep([Measurement("40", 0.3, 0.1, 2.0, default=True)])
     assert panels([single]) == []
     assert pareto_figures([single]) == []
-    assert "40 (run)" in accuracy_tables([single])
+    assert "40 (run)" in accuracy_section([single])
 
 
 def test_every_ladder_has_a_figure_with_all_its_rungs():
@@ -97,12 +97,12 @@ def test_every_ladder_has_a_figure_with_all_its_rungs():
 def test_no_name_becomes_markup():
     measurements = [Measurement(NASTY, 0.1, 0.0, 1.0), Measurement("b", 0.01, 0.0, 2.0)]
     sweep = make_sweep(measurements, knob=NASTY, unit=NASTY, note=NASTY)
-    assert "<img" not in accuracy_tables([sweep])
+    assert "<img" not in accuracy_section([sweep])
     assert "<img" not in str(pareto_figures([sweep]))
 
 
 def test_tables_name_what_to_choose_and_what_the_run_does():
-    text = accuracy_tables([make_sweep(note="in 3 scenes")])
+    text = accuracy_section([make_sweep(note="in 3 scenes")])
     assert "64 (run)" in text
     assert text.count("to choose</td>") == 1
     assert "Note: in 3 scenes." in text

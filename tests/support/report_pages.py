@@ -12,7 +12,7 @@ from lidardesign.evaluation.results import Evaluation, Paired
 from lidardesign.report.density_views import density_view
 from lidardesign.report.page import Report
 from lidardesign.report.scene_figure import scene_figure
-from lidardesign.report.tables import CommandTimes, Reproduction
+from lidardesign.report.sections import CommandTimes, Reproduction
 from lidardesign.samples import Samples
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import Outcome, Rays, gate_outcomes

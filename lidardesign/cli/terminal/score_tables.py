@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from lidardesign.cli.terminal.grids import RichConsole, difference_cell, duration, number, print_table, value_cells
 from lidardesign.run.clock import INSIDE, OTHER
+from lidardesign.run.markup import plain_number
 
 if TYPE_CHECKING:
     from lidardesign.evaluation.results import Evaluation
@@ -187,8 +188,6 @@ def _show_grid(title: str, places: Sequence[tuple[str, int, str]], cells: Sequen
 
 def _show_effects(document: Entry, rich: RichConsole) -> None:
     """Print the effects that were simulated with the reasons; one line where none was needed."""
-    from lidardesign.report.tables import plain_number
-
     detector, effects = document["detector"], document["effects"]
     if not any(effect["on"] or effect["bound"] or effect["lost"] for effect in effects):
         rich.print(f"effects: none needed with the detector {detector}", soft_wrap=True)
