@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from lidardesign.api.scores import Scores
     from lidardesign.api.seeds import evaluate_seeds
     from lidardesign.constraints.document import Constraints
+    from lidardesign.formats import Format
+    from lidardesign.formats.rig import Rig, RigSensor
+    from lidardesign.problem.problem import DesignResult, ray_design
     from lidardesign.scenes.rays import Rays, Returns
     from lidardesign.scenes.scene import (
         Ambient,
@@ -43,14 +46,17 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 __all__ = [
-    "Ambient", "Body", "Box", "Capsule", "Constraints", "Cylinder", "Defaults", "Design", "DesignSpace", "Ellipsoid",
-    "Information", "Medium", "Mesh", "Metric", "Plane", "Rays", "Receiver", "Returns", "Run", "Scene", "Score",
-    "Scores", "Sphere", "Split", "Task", "TaskConfig", "__version__", "evaluate_seeds", "learn", "load_design",
-    "open_run", "random_generator", "rigid",
+    "Ambient", "Body", "Box", "Capsule", "Constraints", "Cylinder", "Defaults", "Design", "DesignResult", "DesignSpace",
+    "Ellipsoid", "Format", "Information", "Medium", "Mesh", "Metric", "Plane", "Rays", "Receiver", "Returns", "Rig",
+    "RigSensor", "Run", "Scene", "Score", "Scores", "Sphere", "Split", "Task", "TaskConfig", "__version__",
+    "evaluate_seeds", "learn", "load_design", "open_run", "random_generator", "ray_design", "rigid",
 ]  # fmt: skip
 # Where names are imported from when they are first used; type checkers read the imports above.
 _HOMES = {
     "lidardesign.constraints.document": "Constraints",
+    "lidardesign.formats": "Format",
+    "lidardesign.formats.rig": "Rig RigSensor",
+    "lidardesign.problem.problem": "DesignResult ray_design",
     "lidardesign.scenes.rays": "Rays Returns",
     "lidardesign.scenes.scene": (
         "Ambient Body Box Capsule Cylinder Ellipsoid Medium Mesh Plane Receiver Scene Sphere rigid"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 from lidardesign.choices.fit import LAYOUTS
 from lidardesign.choices.flag import flags_of
@@ -14,7 +14,7 @@ from lidardesign.fitting.request import FitRequest
 from lidardesign.formats.designs import relative_folder
 from lidardesign.plugins import plugin_guard
 from lidardesign.problem.method import DESIGN, METHODS, Method, design_by, refusal_of
-from lidardesign.problem.problem import Problem
+from lidardesign.problem.problem import DesignResult, Problem
 from lidardesign.problem.world import World
 from lidardesign.rays.training_scenes import TrainingScenes
 from lidardesign.run.manifest import versions
@@ -91,9 +91,8 @@ class MethodRequest:
 
     def design(self) -> DesignSpec:
         """The design that the method makes."""
-        result = design_by(self.method, self.problem)
-        if result is None:
-            raise ConfigError("makes no design", where=f"--method {self.method.name}")
+        # there is none only where no number of rays is asked for
+        result = cast(DesignResult, design_by(self.method, self.problem))
         for note in result.notes:
             self.notes(note)
         if self.problem.gates == "ray" and not result.design.has_gates_per_ray:

@@ -24,7 +24,7 @@ from lidardesign.problem.problem import DesignResult, Problem
 from lidardesign.problem.world import World
 from lidardesign.rays.information import surface_information
 from lidardesign.rays.training_scenes import TrainingScenes
-from lidardesign.scenes.rays import Rays, Returns
+from lidardesign.scenes.rays import Returns
 from lidardesign.scenes.scene import Body, Scene, Sphere, rigid
 from lidardesign.sensors.design_file import save_design
 from lidardesign.simulate.plan import Planner
@@ -97,7 +97,10 @@ class MethodSubject(Tried):
         if refused is not None:
             return None
         with self.calling("design"), suppress(InfeasibleError):
-            return self.method.design(problem)
+            result = self.method.design(problem)
+            if result is None and problem.rays is not None:
+                raise BrokenLawError(f"design neither makes nor refuses {asked_text(problem)}")
+            return result
         return None
 
 
@@ -129,11 +132,11 @@ def check_repeated(subject: MethodSubject) -> LawHolds:
     """The same world and seed give the same design, and another draw another one where they are drawn anew."""
     for first, again in zip(subject.problems(), subject.problems(), strict=True):
         one, same = subject.design(first), subject.design(again)
-        if (one is None) != (same is None) or (one and same and fingerprint(_rays(one)) != fingerprint(_rays(same))):
+        if _fingerprint(one) != _fingerprint(same):
             fault = f"{asked_text(first)}: another design the second time"
             raise BrokenLawError(fault, hint="draw from the world's seed")
         other = subject.design(replace(first, draw=1)) if one and subject.method.is_redrawn else None
-        if one and other and fingerprint(_rays(one)) == fingerprint(_rays(other)):
+        if other and _fingerprint(one) == _fingerprint(other):
             raise BrokenLawError(f"{asked_text(first)}: says that it is drawn anew, and is not")
     return LawHolds("the same world gives the same designs")
 
@@ -146,13 +149,13 @@ def check_saved(subject: MethodSubject) -> LawHolds:
             if result is not None:
                 path = Path(folder) / "design.yaml"
                 save_design(result.design, path)
-                if fingerprint(load_design(path).rays()) != fingerprint(_rays(result)):
+                if fingerprint(load_design(path).rays()) != _fingerprint(result):
                     raise BrokenLawError(f"{asked_text(problem)}: fires other rays once it is saved")
     return LawHolds("designs can be saved")
 
 
-def _rays(result: DesignResult) -> Rays:
-    return result.design.rays()
+def _fingerprint(result: DesignResult | None) -> str:
+    return fingerprint(result and result.design.rays())
 
 
 _AFTER_FIRST = ("designs are made",)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidardesign.errors import InfeasibleError, PluginError
+from lidardesign.errors import InfeasibleError
 from lidardesign.evaluation.entries import SINGLE, Entry
 from lidardesign.evaluation.request import EvaluationRequest
 from lidardesign.methods.cma import SearchRecord
@@ -110,14 +110,13 @@ def _add(request: EvaluationRequest, found: Rivals, asked: Asked) -> None:
     problem = replace(asked.problem, config=request.settings.get(method.name))
     refusal = refusal_of(method, problem)
     if refusal is not None:
-        found.note(f"{method.name} is left out: {refusal}" if refusal else "")
+        at = " at equal bandwidth" if any(entry.name == method.name for entry in found.entries) else ""
+        found.note(f"{method.name} is left out{at}: {refusal}" if refusal else "")
         return
     rays_of: Callable[[DesignSpec], Positions] = partial(fired, conditions=request.conditions, planner=request.planner)
     search, redraw = None, None
     try:
         result = design_by(method, problem)
-        if result is None and matched is None:
-            raise PluginError(f"makes no design of {problem.rays} rays", where=f"method {method.name}")
         if result is None:
             found.unbounded.add((matched.name, method.name))
             return

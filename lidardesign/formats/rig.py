@@ -102,8 +102,8 @@ class Rig:
 
     kind: str
     sensors: Sequence[RigSensor]
-    notes: Sequence[str]
-    end_hint: str
+    notes: Sequence[str] = ()
+    end_hint: str = "give their ends in the file"
 
 
 def rig_design(rig: Rig, path: Path, reach_m: float | None) -> DesignSpec:

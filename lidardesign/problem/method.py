@@ -5,14 +5,15 @@ Experimental: it may change with the next version.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import contextlib
+from collections.abc import Iterator, Mapping
 from typing import Any, Protocol
 
 import numpy as np
 
-from lidardesign.errors import LidardesignError, PluginError
+from lidardesign.errors import ConfigError, LidardesignError, PluginError
 from lidardesign.numerics import COARSE_SLACK
-from lidardesign.plugins import PluginKind, check_members, plugin_guard
+from lidardesign.plugins import AUTHOR_HINT, PluginKind, check_members, plugin_guard
 from lidardesign.problem.problem import DesignResult, Problem
 from lidardesign.sensors.adaptive import mean_mbps
 from lidardesign.sensors.design import DesignSpec
@@ -65,9 +66,21 @@ def check_method(name: str, method: Any) -> Mapping[str, Any]:
 METHODS: PluginKind[Method] = PluginKind("lidardesign.methods", "method", check_method)
 
 
+@contextlib.contextmanager
+def _contained(method: Method) -> Iterator[None]:
+    """Run a method's code; what another package's configures wrongly, as rays of NaN, is no fault of the user."""
+    try:
+        with plugin_guard(method.name, "method"):
+            yield
+    except ConfigError as error:
+        if METHODS.is_shipped(method.name):
+            raise
+        raise PluginError(str(error), where=f"method {method.name}", hint=AUTHOR_HINT) from error
+
+
 def refusal_of(method: Method, problem: Problem) -> str | None:
     """The reason why a method makes no design for a problem, or None."""
-    with plugin_guard(method.name, "method"):
+    with _contained(method):
         return method.refuses(problem)
 
 
@@ -77,10 +90,8 @@ def design_by(method: Method, problem: Problem) -> DesignResult | None:
     Raises:
         PluginError: The method raised, or made something else than what was asked for.
     """
-    with plugin_guard(method.name, "method"):
+    with _contained(method):
         result = method.design(problem)
-    if result is None:
-        return None
     fault = fault_of(result, problem, is_trusted=METHODS.is_shipped(method.name))
     if fault is not None:
         raise PluginError(f"its design {fault}", where=f"method {method.name}")
@@ -89,6 +100,8 @@ def design_by(method: Method, problem: Problem) -> DesignResult | None:
 
 def fault_of(result: Any, problem: Problem, *, is_trusted: bool) -> str | None:
     """What a design is not that a problem asks for; of a trusted one whether it can be fired alone."""
+    if result is None and problem.rays is None:
+        return None
     design = getattr(result, "design", None)
     if not isinstance(design, DesignSpec):
         return f"is of type {type(design).__name__}"

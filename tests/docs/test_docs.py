@@ -11,13 +11,12 @@ import pytest
 
 from lidardesign.config import resolve
 from lidardesign.constraints.document import Constraints
-from lidardesign.contract import contract_of_plugin
 from lidardesign.errors import LidardesignError
-from lidardesign.formats import FORMATS
 from lidardesign.run.yaml import parse_yaml
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Scene
 from lidardesign.simulate.returns import simulate
+from lidardesign.space import DesignSpace
 from lidardesign.task import Task, check_interface, conditions_of, load_task
 
 ROOT = Path(__file__).parents[2]
@@ -136,17 +135,11 @@ def test_the_example_task_keeps_the_contract_and_scores_a_ray():
     assert resolve(task).space == task.space(config)
 
 
-def moving_scene_of(name: str, block: int):
-    """A task of docs/writing-tasks.md, held to the contract, and its first held-out scene."""
-    namespace: dict[str, object] = {}
+def task_of_the_guide(name: str, block: int, **names: object):
+    """A task of docs/writing-tasks.md."""
+    namespace = names
     exec(blocks("python", WRITING_TASKS)[block], namespace)  # the page's own text
-    task = namespace[name]()
-    check_interface(task.name, task)
-    config = task.Config()
-    first, again = (task.scenes(config, "test", 0)[0] for _ in range(2))
-    for one, other in zip(first.bodies, again.bodies, strict=True):
-        assert np.array_equal(one.poses, other.poses)
-    return task, config, first
+    return namespace[name]()
 
 
 def rays_at(points: np.ndarray, origin: np.ndarray) -> Rays:
@@ -159,7 +152,12 @@ def rays_at(points: np.ndarray, origin: np.ndarray) -> Rays:
 
 
 def test_the_moving_ball_of_the_guide_is_scored_over_its_frames():
-    task, config, scene = moving_scene_of("PassingTask", 0)
+    task = task_of_the_guide("PassingTask", 0)
+    check_interface(task.name, task)
+    config = task.Config()
+    scene, again = (task.scenes(config, "test", 0)[0] for _ in range(2))
+    for one, other in zip(scene.bodies, again.bodies, strict=True):
+        assert np.array_equal(one.poses, other.poses)
     assert resolve(task).space == task.space(config)
     origin, ball = np.array([0.0, 0.0, 0.3]), scene.bodies[0]
     assert scene.frames == config.frames
@@ -172,26 +170,17 @@ def test_the_moving_ball_of_the_guide_is_scored_over_its_frames():
     )
 
 
-def test_the_drive_of_the_guide_is_scored_over_its_positions():
-    task, config, scene = moving_scene_of("DriveTask", 1)
-    space = resolve(task).space
-    assert space.condition == ("x_m",)
-    places = conditions_of(task, config, space)
-    assert len(places) == 4
-    sign = scene.bodies[0].pose()[:3, 3]
-    rays = [rays_at(sign[None], np.array([place["x_m"], 0.0, 0.0])) for place in places]
-    returns = [frame for one in rays for frame in simulate(scene, one)]
-    assert task.score(scene, returns).value == 0.0
-    away = Rays(rays[0].origin_m, -rays[0].direction, rays[0].gate_m, rays[0].sensor, rays[0].time_s)
-    assert task.score(scene, [*simulate(scene, away), *returns[1:]]).value == 25.0
+def test_the_positions_of_the_guide_lie_in_its_space():
+    task = task_of_the_guide("DriveTask", 1, DesignSpace=DesignSpace)
+    assert len(conditions_of(task, None, task.space(None))) == 4
 
 
-def test_the_format_of_the_guide_is_short_and_keeps_every_law():
-    code = next(one for one in blocks("python", WRITING_METHODS) if "POINTS" in one)
-    assert len(code.splitlines()) <= 35
-    namespace: dict[str, object] = {}
-    exec(code, namespace)  # the page's own text
-    assert {one.outcome for one in contract_of_plugin(FORMATS, namespace["POINTS"]).findings()} == {"pass"}
+def test_the_guide_shows_the_short_method_and_format_of_the_example_package():
+    package = ROOT / "examples" / "third_party" / "lidardesign_landing"
+    for name in ("fibonacci", "vtk"):
+        code = (package / f"{name}.py").read_text(encoding="utf-8")
+        assert code in blocks("python", WRITING_METHODS)
+        assert len(code.splitlines()) <= 35
 
 
 @pytest.mark.parametrize("page", [ROOT / "README.md", *sorted(DOCS.glob("*.md"))], ids=lambda p: p.name)

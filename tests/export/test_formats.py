@@ -20,29 +20,10 @@ from lidardesign.formats import FORMATS, Format, write_design
 from lidardesign.formats.designs import load_design
 from lidardesign.sensors.design_file import save_design
 
-ROOT = Path(__file__).parents[2]
-# A small whole format that keeps the contract and reads its own files; broken ones are made of it by replacing words.
-GOOD = """
-import numpy as np
-from lidardesign.formats.rig import Rig, RigSensor
-
-
-class Plugin:
-    name, suffix, summary = "NAME", ".NAME", "a line of numbers per ray"
-    reader, checked = "a script", "read by itself"
-    api_version, holds, is_folder = 1, frozenset({"rays"}), False
-
-    def write(self, design, rays, path, options):
-        columns = [rays.origin_m, rays.azimuth_rad[:, None], rays.elevation_rad[:, None], rays.gate_m]
-        table = np.hstack(columns)
-        path.write_text("".join(" ".join(map(repr, row)) + "\\n" for row in table.tolist()))
-        return ["sensors and times are lost"]
-
-    def read(self, path):
-        table = np.loadtxt(path, ndmin=2)
-        return Rig("NAME", [RigSensor("all", table[:, :3], table[:, 3], table[:, 4], table[:, 5:])], [], "")
-"""
-WRITE = "        columns = ["
+# The format of the example package, under a name; broken ones are made of it by replacing words.
+EXAMPLE = Path(__file__).parents[2] / "examples" / "third_party" / "lidardesign_landing"
+GOOD = (EXAMPLE / "vtk.py").read_text(encoding="utf-8").replace('vtk"', 'NAME"').replace("VTK = ", "Plugin = ")
+WRITE, MADE = "    gate = [", "read=read)"
 
 
 def test_the_shipped_formats_keep_the_contract(format_law):
@@ -95,17 +76,17 @@ def test_a_format_of_another_package_is_listed_written_read_and_checked(install,
 
 # What is broken when it is used or imported: words that are replaced, and what is said of it.
 BROKEN = {
-    "raises": (WRITE, "        1 / 0\n" + WRITE, "ZeroDivisionError"),
-    "stops": (WRITE, "        path.write_text('half')\n        raise RuntimeError('half-way')\n" + WRITE, "half-way"),
-    "writes_nothing": ("        path.write_text(", "        str(", "wrote no file"),
-    "is_a_folder": ("False", "True", "wrote no folder"),
+    "raises": (WRITE, "    1 / 0\n" + WRITE, "ZeroDivisionError"),
+    "stops": (WRITE, "    path.write_text('half')\n    raise RuntimeError('half-way')\n" + WRITE, "half-way"),
+    "writes_nothing": ("    path.write_text(", "    str(", "wrote no file"),
+    "is_a_folder": (MADE, "read=read, is_folder=True)", "wrote no folder"),
     "says_no_notes": ("return [", "return None and [", "TypeError"),
-    "leaves": (WRITE, "        raise SystemExit(3)\n" + WRITE, "exit 3"),
+    "leaves": (WRITE, "    raise SystemExit(3)\n" + WRITE, "exit 3"),
     "crashes": (GOOD, "import ctypes\nctypes.string_at(0)", "crashes while it is imported"),
-    "is_of_another_version": ("is_folder = 1,", "is_folder = 7,", "version 7 of the format interface"),
-    "holds_everything": ('{"rays"}', '{"rays", "colour"}', "holds colour"),
+    "is_of_another_version": (MADE, "read=read, api_version=7)", "version 7 of the format interface"),
+    "holds_everything": (MADE, 'read=read, holds=frozenset({"rays", "colour"}))', "holds colour"),
     "has_no_dot": ('".NAME"', '"NAME"', "its suffix is 'has_no_dot'"),
-    "has_no_write": ("def write(", "def writes(", "no method write()"),
+    "has_no_write": (", write,", ", None,", "no method write()"),
 }
 
 
@@ -126,8 +107,9 @@ def test_a_broken_format_exits_6_and_leaves_what_was_there(install, design, lida
 
 
 def test_a_file_is_never_written_over_a_folder_nor_a_folder_over_a_file(install, tmp_path):
-    folder = '        path.mkdir()\n        (path / "a").write_text("a")\n        return []\n'
-    install({"one": GOOD, "many": GOOD.replace("False", "True").replace(WRITE, folder + WRITE)})
+    folder = '    path.mkdir()\n    (path / "a").write_text("a")\n    return []\n'
+    many = GOOD.replace(MADE, "is_folder=True)").replace(WRITE, folder + WRITE)
+    install({"one": GOOD, "many": many})
     (tmp_path / "folder").mkdir()
     (tmp_path / "file").write_text("mine", encoding="utf-8")
     for name, taken in (("one", "folder"), ("many", "file")):
@@ -139,7 +121,7 @@ def test_a_file_is_never_written_over_a_folder_nor_a_folder_over_a_file(install,
 
 
 def test_a_foreign_reader_is_asked_only_for_what_no_shipped_one_knows_and_contained(install, tmp_path):
-    install({"sdf2": GOOD.replace("np.loadtxt(path, ndmin=2)", "1 / 0"), "xml": "1 / 0"})
+    install({"sdf2": GOOD.replace("path.read_text()", "1 / 0"), "xml": "1 / 0"})
     for path in (tmp_path / "rig.sdf2", tmp_path / "rig.xml"):
         path.write_text("<mujoco/>", encoding="utf-8")
     with pytest.raises(PluginError, match="ZeroDivisionError"):
@@ -150,29 +132,29 @@ def test_a_foreign_reader_is_asked_only_for_what_no_shipped_one_knows_and_contai
 
 
 # What a format is changed into, by the law that it then breaks: words that are replaced, and what is said of it.
-TWICE = "        self.n = getattr(self, 'n', 0) + 1\n        path.write_text(str(self.n))\n        return []\n"
-HALF = "        path.write_text('')\n        [design.sensors[one] for one in rays.sensor]\n"
+TWICE = "    write.n = getattr(write, 'n', 0) + 1\n    path.write_text(str(write.n))\n    return []\n"
+HALF = "    path.write_text('')\n    [design.sensors[one] for one in rays.sensor]\n"
 LAWLESS = {
     "designs are written": [
         (WRITE, TWICE + WRITE, "other bytes or notes the second time"),
-        (WRITE, "        rays.gate_m[:] = 1.0\n" + WRITE, "writing changed the design"),
-        (WRITE, "        (path.parent / 'more').touch()\n" + WRITE, "design.points, more"),
-        (WRITE, "        raise ValueError('never')\n" + WRITE, "write failed: ValueError: never"),
-        ('return ["sensors and times are lost"]', 'return ("lost",)', "a list of notes"),
+        (WRITE, "    rays.gate_m[:] = 1.0\n" + WRITE, "writing changed the design"),
+        (WRITE, "    (path.parent / 'more').touch()\n" + WRITE, "design.points, more"),
+        (WRITE, "    raise ValueError('never')\n" + WRITE, "write failed: ValueError: never"),
+        ('return ["sensors and firing times are lost"]', 'return ("lost",)', "a list of notes"),
     ],
     "says what it holds": [
-        ('{"rays"}', '{"rays", "rate"}', "says that it holds rate, but writes the same without"),
-        ('{"rays"}', '{"rays", "adaptive"}', "says that it holds adaptive"),
+        (MADE, 'holds=frozenset({"rate"}))', "says that it holds rate, but writes the same without"),
+        (MADE, 'holds=frozenset({"adaptive"}))', "says that it holds adaptive"),
     ],
     "files are whole": [
         (WRITE, HALF + WRITE, "half-written"),
-        (WRITE, "        import shutil\n        shutil.rmtree(path, ignore_errors=True)\n" + WRITE, "in its place"),
+        (WRITE, "    import shutil\n    shutil.rmtree(path, ignore_errors=True)\n" + WRITE, "in its place"),
     ],
     "rays come back": [
-        ("table[:, 4], table", "table[:, 4] / 2, 2 + table", "direction, gate_m came back changed, and 1 notes"),
-        ("np.loadtxt(path, ndmin=2)", "np.loadtxt(path, ndmin=2)[:1]", "1 rays were read of 6"),
+        ("np.arctan2(z, np.hypot(x, y)), gate", "z, 2 + gate", "direction, gate_m came back changed, and 1 notes"),
+        ("    x, y, z", "    points = points[:1]\n    x, y, z", "1 rays were read of 6"),
     ],
-    "no global random state": [(WRITE, "        np.random.uniform()\n" + WRITE, "numpy's random in write")],
+    "no global random state": [(WRITE, "    np.random.uniform()\n" + WRITE, "numpy's random in write")],
 }
 
 
@@ -182,7 +164,7 @@ def test_a_law_names_what_is_wrong(law):
         assert old in GOOD
         namespace: dict = {}
         exec(GOOD.replace(old, new).replace("NAME", "points"), namespace)
-        finding = contract_of_plugin(FORMATS, namespace["Plugin"]()).finding(law)
+        finding = contract_of_plugin(FORMATS, namespace["Plugin"]).finding(law)
         assert finding.outcome == "fail", (law, new)
         assert words in finding.detail
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import pytest
@@ -13,11 +12,9 @@ import lidardesign.methods
 from lidardesign.contract import contract_of_plugin
 from lidardesign.problem.method import DESIGN, METHODS
 
-ROOT = Path(__file__).parents[2]
-# The method of docs/writing-methods.md; broken ones are made of it by replacing words.
-GOOD = re.search(r"```python\n(.*?)```", (ROOT / "docs" / "writing-methods.md").read_text(encoding="utf-8"), re.DOTALL)[
-    1
-]
+# The method of the example package; broken ones are made of it by replacing words.
+EXAMPLE = Path(__file__).parents[2] / "examples" / "third_party" / "lidardesign_landing"
+GOOD = (EXAMPLE / "fibonacci.py").read_text(encoding="utf-8")
 
 
 def test_the_shipped_methods_keep_the_contract(method_law):
@@ -39,7 +36,7 @@ install = install_fixture("method")
 
 def source_of(name, *changes):
     """A method's source under a name, with words replaced."""
-    text = GOOD.replace('"middle"', f'"{name}"').replace("MIDDLE", "Plugin")
+    text = GOOD.replace('"fibonacci"', f'"{name}"').replace("FIBONACCI", "Plugin")
     for old, new in changes:
         assert old in text
         text = text.replace(old, new)
@@ -52,9 +49,10 @@ def test_a_method_of_another_package_is_listed_a_baseline_a_design_and_checked(i
     assert "no licence" in listed["other"]["error"]
     assert listed["greedy"]["error"] is None
     assert lidardesign("fit", flat, "--method", "middle", "--rays", "9", "--name", "mine").code == 0
-    rows = lidardesign("evaluate", flat, "--rays", "9", "--baseline", "middle", "--json").json["rows"]
-    mine, middle = ([row["value"] for row in rows if row["design"] == name] for name in ("mine", "middle"))
-    assert mine == middle
+    scored = lidardesign("evaluate", flat, "--rays", "9", "--baseline", "middle", "--json")
+    found = [[row["value"] for row in scored.json["rows"] if row["design"] == name] for name in ("mine", "middle")]
+    assert found[0] == found[1]
+    assert "middle is left out at equal bandwidth: only for a number of rays" in scored.json["notes"]
     checked = lidardesign("methods", "check", "middle", "--json")
     assert checked.code == 0, checked.err
     assert {law["outcome"] for law in checked.json["laws"]} == {"pass"}
@@ -67,10 +65,11 @@ BROKEN = {
     "raises": (DESIGNS, DESIGNS + "        1 / 0\n", "ZeroDivisionError"),
     "leaves": (DESIGNS, DESIGNS + "        raise SystemExit(3)\n", "exit 3"),
     "fires_more": (DESIGNS, "        world, count = problem.world, problem.rays + 1\n", "fires 10 rays, not 9"),
-    "is_outside": ("(high - low)[3] *", "9 +", "outside the design space"),
-    "says_a_word": ("return DesignResult(", "return str(", "is of type NoneType"),
+    "is_outside": ("azimuth = right", "azimuth = 9", "outside the design space"),
+    "is_not_a_number": ("azimuth = right", "azimuth = np.nan", "NaN"),
+    "says_nothing": ("return DesignResult(", "DesignResult(", "is of type NoneType"),
     "crashes": (GOOD.partition("\n")[0], "import ctypes\nctypes.string_at(0)", "crashes while it is imported"),
-    "is_of_another_version": ('space", 1', 'space", 7', "version 7 of the method interface"),
+    "is_of_another_version": ('middle", 1', 'middle", 7', "version 7 of the method interface"),
     "has_no_design": ("def design(", "def designs(", "no method design()"),
 }
 
@@ -89,8 +88,13 @@ def test_a_broken_method_exits_6_and_nothing_else_is_lost(install, flat, lidarde
 
 
 def test_a_law_names_what_is_wrong_with_a_method():
-    scope = {}
-    exec(source_of("moody", (DESIGNS, DESIGNS + "        count += np.random.default_rng().integers(2)\n")), scope)
-    contract = contract_of_plugin(METHODS, scope["Plugin"])
-    found = {finding.law: finding for finding in contract.findings()}
-    assert "fail" in {found["designs are made"].outcome, found["designs repeat"].outcome}
+    silent = DESIGNS + "        if count > 1:\n            return None\n"
+    for old, new, law, words in (
+        (DESIGNS, silent, "designs are made", "neither makes nor refuses 12 rays"),
+        ("index / GOLDEN", "index * np.random.default_rng().random()", "designs repeat", "the second time"),
+    ):
+        scope = {}
+        exec(source_of("moody", (old, new)), scope)
+        finding = contract_of_plugin(METHODS, scope["Plugin"]).finding(law)
+        assert finding.outcome == "fail"
+        assert words in finding.detail

@@ -27,7 +27,7 @@ from lidardesign.errors import ConfigError, DataError
 pytest_plugins = ["pytester"]
 ROOT = Path(__file__).parents[2]
 TEMPLATES = ROOT / "lidardesign" / "contract" / "template"
-EXAMPLE, STREET = ROOT / "examples" / "third_party_task", ROOT / "examples" / "street"
+EXAMPLE, STREET = ROOT / "examples" / "third_party", ROOT / "examples" / "street"
 NAME = "landmark"
 
 

@@ -1,5 +1,0 @@
-"""The contract of lidardesign's tasks, one test per law, with boxes at rest and driving."""
-
-
-def test_the_task_keeps_the_contract(task_law):
-    task_law.check()
