@@ -97,7 +97,7 @@ coverage: $(BIN)/.dev
 	@mkdir -p build
 	$(KERNELS) run --rcfile=/dev/null --branch --source=lidardesign --data-file=build/kernels.coverage \
 		-m pytest -W ignore::RuntimeWarning tests/density/test_splines.py tests/density/test_frames.py \
-		tests/density/test_visibility.py tests/geometry/test_raycast.py tests/selection/test_groups.py
+		tests/density/test_visibility.py tests/scenes/test_raycast.py tests/rays/test_groups.py
 	$(KERNELS) report --rcfile=/dev/null --data-file=build/kernels.coverage --include='*kernels.py'
 	$(BIN)/python -m coverage report --fail-under=95
 

@@ -13,6 +13,7 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "lidardesign"
 TASKS = ROOT / "tasks" / "lidardesign_tasks"
 MOST_MODULES = 14
+BESIDE_ROOMS = {"docs", "fuzz", "soak", "tasks"}  # what tests in folders of their own are about, beside the rooms
 MOST_PARAMETERS, MOST_KEYS, MOST_IMPORTS = 11, 4, 20
 
 # From the ground up: a room imports its own modules and those of rooms before it.
@@ -168,6 +169,12 @@ def test_folders_are_small_enough_to_overlook():
         if len(modules) > MOST_MODULES:
             crowded[str(folder.relative_to(ROOT))] = len(modules)
     assert not crowded
+
+
+def test_tests_stand_in_rooms_named_after_the_packages():
+    rooms = {path.name for path in PACKAGE.iterdir() if path.is_dir()}
+    astray = {path.parent.name for path in (ROOT / "tests").glob("*/test_*.py")} - rooms - BESIDE_ROOMS
+    assert not astray
 
 
 def test_a_public_class_name_stands_for_one_thing():

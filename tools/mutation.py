@@ -31,16 +31,16 @@ from benchmarks.soak.long_runs import heading, kept, table, write_page  # noqa: 
 # The files that test each module. A change outside of functions meets the first one alone, whole.
 TESTS = {
     "lidardesign/numerics.py": ("test_numerics.py",),
-    "lidardesign/mixture/components.py": ("design/test_mixture.py",),
+    "lidardesign/mixture/components.py": ("mixture/test_mixture.py",),
     "lidardesign/constraints/document.py": (
-        "design/test_constraints.py", "design/test_check.py", "design/test_hard_constraints.py",
+        "constraints/test_constraints.py", "constraints/test_check.py", "constraints/test_hard_constraints.py",
     ),
     "lidardesign/sensors/pattern.py": (
-        "design/test_pattern.py", "design/test_rays.py", "design/test_designs.py", "design/test_samplers.py",
+        "sensors/test_pattern.py", "sensors/test_rays.py", "sensors/test_designs.py", "density/test_samplers.py",
     ),
     "lidardesign/rays/choice.py": (
-        "selection/test_search.py", "selection/test_choice.py", "selection/test_groups.py",
-        "selection/test_certified.py", "selection/test_selection.py", "selection/test_adaptive.py",
+        "rays/test_search.py", "rays/test_choice.py", "rays/test_groups.py",
+        "rays/test_certified.py", "rays/test_selection.py", "rays/test_adaptive.py",
     ),
 }  # fmt: skip
 # Packages and modules that a mutant is to meet anew; the tests are too.

@@ -4,8 +4,8 @@
 set -euo pipefail
 . "$(dirname "$0")/pythons.sh"
 own="$("$1" -c 'import sys; print("%d.%d" % sys.version_info[:2])')"
-core=(tests/test_numerics.py tests/test_space.py tests/test_config.py tests/test_meshio.py tests/density/test_quality.py
-    tests/density/test_splines.py tests/simulate/test_plan.py tests/selection tests/api/test_api.py)
+core=(tests/test_numerics.py tests/test_space.py tests/test_config.py tests/scenes/test_meshio.py tests/density/test_quality.py
+    tests/density/test_splines.py tests/simulate/test_plan.py tests/rays tests/fitting/test_part_design.py tests/api/test_api.py)
 for version in 3.11 3.12 3.13; do
     [ "$version" = "$own" ] && continue
     python="$(found_python "$version")" && room_for_python "$version" || continue
