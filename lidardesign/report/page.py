@@ -20,6 +20,7 @@ from lidardesign.estimates import figure_and_interval
 from lidardesign.evaluation.headline import headline_texts
 from lidardesign.evaluation.request import EvaluationRequest
 from lidardesign.evaluation.results import Evaluation, Paired, Row, verdict
+from lidardesign.evaluation.sweep import Sweep
 from lidardesign.report.choice import choice_section
 from lidardesign.report.density_views import DensityView, density_view
 from lidardesign.report.figures import (
@@ -57,7 +58,6 @@ from lidardesign.report.view import view_section
 from lidardesign.run.clock import phase
 from lidardesign.run.files import write_atomic
 from lidardesign.run.manifest import read_manifest, versions
-from lidardesign.scoring.sweep import Sweep
 from lidardesign.sensors.design import MOST_GAP, DesignSpec
 from lidardesign.space import observed_point
 from lidardesign.task import random_generator

@@ -12,7 +12,7 @@ from lidardesign.run.clock import INSIDE, OTHER
 
 if TYPE_CHECKING:
     from lidardesign.evaluation.results import Evaluation
-    from lidardesign.scoring.sweep import Accuracy, Measurement, Sweep
+    from lidardesign.evaluation.sweep import Accuracy, Measurement, Sweep
 
 
 Entry = dict[str, Any]
