@@ -151,7 +151,7 @@ def check_untouched(subject: Subject) -> LawHolds:
 def check_prepared(subject: Subject) -> LawHolds | NotApplicable:
     """What is prepared anew, and was not scored by yet, gives the same scores; the scenes are as they were."""
     if not prepares(subject.task):
-        return NotApplicable("the task has no method prepare, so scores follow from the returns of one scene")
+        return NotApplicable("the task has no method prepare")
     again, worst, limit = subject.new_preparation(), 0.0, ORDER_SHARE * subject.metric.tolerance
     for number, scene in enumerate(subject.looked_at):
         returns = subject.returns(number, subject.rays(0, DENSE))

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+import sys
 from pathlib import Path
+from types import ModuleType
 from typing import get_args
 
 import numpy as np
@@ -11,7 +13,7 @@ import pytest
 
 from lidardesign.config import resolve
 from lidardesign.constraints.document import Constraints
-from lidardesign.contract import contract_of_plugin
+from lidardesign.contract import check_task, contract_of_plugin
 from lidardesign.errors import LidardesignError
 from lidardesign.formats import FORMATS
 from lidardesign.run.yaml import parse_yaml
@@ -184,6 +186,20 @@ def test_the_drive_of_the_guide_is_scored_over_its_positions():
     assert task.score(scene, returns).value == 0.0
     away = Rays(rays[0].origin_m, -rays[0].direction, rays[0].gate_m, rays[0].sensor, rays[0].time_s)
     assert task.score(scene, [*simulate(scene, away), *returns[1:]]).value == 25.0
+
+
+def test_the_distance_of_the_guide_is_learned_and_keeps_every_law(monkeypatch):
+    passing, distance = ModuleType("my_tasks.passing"), {"__name__": "__main__"}
+    exec(blocks("python", WRITING_TASKS)[0], vars(passing))  # the page's own text
+    monkeypatch.setitem(sys.modules, "my_tasks", ModuleType("my_tasks"))
+    monkeypatch.setitem(sys.modules, "my_tasks.passing", passing)
+    exec(blocks("python", WRITING_TASKS)[2], distance)
+    kept = {one.law: one for one in check_task(distance["DistanceTask"]())}
+    assert {law for law, one in kept.items() if one.outcome == "skip"} == {
+        "conditions lie in the space", "scenes repeat elsewhere", "order does not matter",
+    }  # fmt: skip
+    assert "prepare_s" in kept["within time"].figures
+    assert kept["best on the truth"].figures["dense"] < 5.0
 
 
 def test_the_format_of_the_guide_is_short_and_keeps_every_law():
