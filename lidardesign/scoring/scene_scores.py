@@ -319,11 +319,12 @@ class Preparation:
         task: The task.
         seed: Root of its random numbers, and of the effects'.
         scenes: Training scenes, of which it gets the first `FEW_SCENES`.
-        planner: The detector, and how effects are chosen; None: geometry alone.
+        planner: The detector, and how effects are chosen, by the rays that come first; None: geometry alone.
     """
 
     def __init__(self, task: Task, seed: int, scenes: Iterable[Scene], planner: Planner | None) -> None:
         self.task, self.seed, self.planner, self._stream = task, seed, planner, scenes
+        self._plans: list[EffectPlan | None] = []
         self._known: dict[str, Any] = {}
 
     @cached_property
@@ -338,18 +339,22 @@ class Preparation:
 
         Arguments:
             lists: The sets of rays.
-            plan: The effects in all scenes; None: those that each scene calls for with these rays.
-            starmap: Map over sets of rays.
+            plan: The effects in all scenes; None: those that each calls for.
+            starmap: Map over scenes, and over sets of rays.
 
         Raises:
             PluginError: The task's `prepare` raised, changed the truth, or returned nothing, or what cannot be pickled.
         """
         if not prepares(self.task):
             return [None] * len(lists)
+        if not self._plans:
+            sensed = ((scene, [rays for one in lists for rays in one]) for scene in self.scenes)
+            is_known = plan is not None or self.planner is None
+            self._plans = [plan] * len(self.scenes) if is_known else [*starmap(self.planner.plan, sensed)]
         # a tuple of patterns counts by its rays alone
-        keys = [fingerprint([[*one], getattr(one, "rule", None), plan and plan.effects]) for one in lists]
+        keys = [fingerprint([[*one], getattr(one, "rule", None)]) for one in lists]
         missing = {key: one for key, one in zip(keys, lists, strict=True) if key not in self._known}
-        asked = ((self.task, self.scenes, one, self.seed, self.planner, plan) for one in missing.values())
+        asked = ((self.task, self.scenes, self._plans, one, self.seed, self.planner) for one in missing.values())
         self._known |= zip(missing, starmap(prepare_for, asked), strict=True)
         found = {key: self._known.pop(key) for key in dict.fromkeys(keys)}
         self._known = dict([*self._known.items()][-MOST_KEPT:]) | found
@@ -360,18 +365,16 @@ class Preparation:
 def prepare_for(
     task: Task,
     scenes: Sequence[Scene],
+    plans: Sequence[EffectPlan | None],
     positions: Positions,
     seed: int,
     planner: Planner | None,
-    plan: EffectPlan | None,
 ) -> Any:
-    """What a task prepares for one set of rays; arguments and errors as of `Preparation`."""
+    """What a task prepares for one set of rays, with the plan of each scene; the rest as of `Preparation`."""
     returns = []
-    for scene in scenes:
-        casters, physics = build_casters(scene), None
-        if planner is not None:
-            physics = planner.physics(plan or planner.plan(scene, positions, casters), seed)
-        returns.append(returns_in_scene(scene, positions, casters, physics))
+    for scene, plan in zip(scenes, plans, strict=True):
+        physics = planner.physics(plan, seed) if planner and plan else None
+        returns.append(returns_in_scene(scene, positions, build_casters(scene), physics))
     return _checked_preparation(task, scenes, returns, seed)
 
 

@@ -166,6 +166,20 @@ def test_training_scores_prepare_once_for_equal_rays_in_any_company():
     assert len(task.learned_from) == len(LISTS) + 1
 
 
+def test_the_rays_that_come_first_say_which_effects_all_meet():
+    planned = []
+
+    class Counted(Planner):
+        def plan(self, scene, lists, casters=None):
+            planned.append((scene.name, len(lists)))
+            return super().plan(scene, lists, casters)
+
+    preparation = Preparation(DistanceTask(), SEED, scenes_of("train"), Counted(NOISY))
+    for lists in (LISTS[:2], LISTS):
+        preparation.of(lists)
+    assert planned == [(scene.name, 2) for scene in preparation.scenes]
+
+
 def test_rays_under_another_rule_of_what_fires_next_are_prepared_for_by_themselves():
     task = DistanceTask()
     first = AdaptiveRays((LISTS[0][0], LISTS[1][0]), PatternRule(np.array([[2.5]]), 1, np.array([9.0])), np.ones(2) / 2)
