@@ -457,7 +457,7 @@ class TrainingScorer:
         casters = self._casters(scene)
         physics = self._physics(number, planned or lists, casters)
         plan = self.plans.get(0) if self._plans_once else None
-        prepared = self._preparation and self._preparation.of(lists, plan)
+        prepared = None if self._preparation is None else self._preparation.of(lists, plan)
         found = score_lists(self.task, self.metric, scene, lists, casters, physics, prepared)
         return [score.value for score, _ in found]
 
