@@ -265,6 +265,9 @@ class Task(Protocol):
     A task may also give `mount_of(config) -> str | None`, the body of a robot that carries the sensors, in whose frame
     its scenes are; designs keep it.
 
+    A task may also give `prepare(scenes, returns, seed)`, which learns a reconstruction for a set of rays from what
+    they return in each training scene. What it makes is picklable, and given to `score(scene, returns, prepared)`.
+
     A task may also give `notes(config, space) -> Sequence[str]`, notes to the user on a configuration before learning:
     lengths that look like another unit, splits that share their objects.
 
@@ -315,6 +318,11 @@ TASKS: PluginKind[Task] = PluginKind("lidardesign.tasks", "task", check_interfac
 def load_task(name: str) -> Task:
     """Load the installed task of a name; errors as of `PluginKind.load`."""
     return TASKS.load(name)
+
+
+def prepares(task: Task) -> bool:
+    """True where a task has a method `prepare`."""
+    return callable(getattr(task, "prepare", None))
 
 
 def random_generator(seed: int, *labels: str | int) -> np.random.Generator:

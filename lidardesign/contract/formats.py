@@ -15,12 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from lidardesign.contract.law import BrokenLawError, Law, LawHolds, NotApplicable, Tried, fingerprint
+from lidardesign.contract.law import BrokenLawError, Law, LawHolds, NotApplicable, Tried
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.formats import ADAPTIVE, EVERY_STEP, RATE, RAYS, ROBOT, Format, WriteOptions
 from lidardesign.formats.designs import load_design
 from lidardesign.formats.rig import rig_design
 from lidardesign.numerics import COARSE_SLACK
+from lidardesign.run.content import fingerprint
 from lidardesign.run.files import remove
 from lidardesign.scenes.mujoco_models import RobotFile
 from lidardesign.scenes.rays import Rays

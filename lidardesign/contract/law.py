@@ -1,38 +1,35 @@
 """Laws of the task contract, the task that they are tried on, and their findings.
 
-Helpers of several laws are here too: digests that are equal for equal content in any process; rays that see a
-scene's targets; and perturbed returns.
+Helpers of several laws are here too: rays that see a scene's targets, and perturbed returns.
 """
 
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import random
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence, Set
-from dataclasses import dataclass, field, fields, is_dataclass
-from enum import Enum
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from functools import cached_property
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from pydantic import BaseModel
 
 from lidardesign.config import RunConfig
 from lidardesign.errors import LidardesignError, PluginError
 from lidardesign.plugins import AUTHOR_HINT, plugin_guard
+from lidardesign.run.content import fingerprint
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import Outcome, Rays, Returns
 from lidardesign.scenes.scene import Body, Scene
 from lidardesign.scenes.surface import sample_body
-from lidardesign.scoring.scene_scores import checked_score
+from lidardesign.scoring.scene_scores import Preparation, checked_score
 from lidardesign.simulate.returns import build_casters, simulate
 from lidardesign.space import AZIMUTH, ELEVATION, FARTHEST_M, RANGE, DesignSpace, aim, direction
-from lidardesign.task import Metric, Score, Split, Task, conditions_of, metric_of, scenes_of
+from lidardesign.task import Metric, Score, Split, Task, conditions_of, metric_of, prepares, scenes_of
 
 PACKAGE = Path(__file__).parents[1]
 # Libraries that tasks call, and that errors are raised in when they are called wrongly.
@@ -308,20 +305,25 @@ class Subject(Tried):
         scene, casters = self.looked_at[number], self.casters[number]
         return [frame for rays in lists for frame in simulate(scene, rays, casters=casters)]
 
-    def score(self, scene: Scene, returns: Sequence[Returns]) -> Score:
-        """The checked score of returns."""
+    def new_preparation(self) -> Preparation:
+        """What the task prepares for rays on its training scenes, to be made anew."""
+        return Preparation(self.task, self.config.seed, self.scenes("train"), None)
+
+    @cached_property
+    def preparation(self) -> Preparation:
+        """What the task prepares for rays, made once."""
+        return self.new_preparation()
+
+    def score(self, scene: Scene, returns: Sequence[Returns], preparation: Preparation | None = None) -> Score:
+        """The checked score of returns, by what was prepared for their rays."""
+        prepared = None
+        if prepares(self.task):
+            with self.calling("prepare"):
+                (prepared,) = (preparation or self.preparation).of(
+                    [tuple(one.rays for one in returns[:: scene.frames])]
+                )
         with self.calling("score"):
-            return checked_score(self.task, self.metric, scene, returns)
-
-
-def fingerprint(value: Any) -> str:
-    """SHA-256 of the content of dataclasses, arrays, models, mappings, sequences and plain values, in hexadecimal.
-
-    Objects of other kinds count by their type and attributes; cached properties of dataclasses do not count.
-    """
-    digest = hashlib.sha256()
-    _add(digest, value)
-    return digest.hexdigest()
+            return checked_score(self.task, self.metric, scene, returns, prepared)
 
 
 def geometry_fingerprint(scene: Scene) -> str:
@@ -331,36 +333,6 @@ def geometry_fingerprint(scene: Scene) -> str:
 
 def _others(of: Body | Scene) -> list[Any]:
     return [getattr(of, field.name) for field in fields(of) if field.name not in UNSEEN]
-
-
-def _add(digest: Any, value: Any) -> None:
-    digest.update(f"<{type(value).__qualname__}>".encode())
-    if isinstance(value, np.ndarray) and value.dtype != object:
-        digest.update(f"{value.dtype.str}{value.shape}".encode())
-        digest.update(np.ascontiguousarray(value).tobytes())
-    elif value is None or isinstance(value, str | bytes | int | float | complex | np.generic | PurePath | Enum):
-        digest.update(repr(value).encode())
-    else:
-        for part in _parts(value):
-            _add(digest, part)
-    digest.update(b"</>")
-
-
-def _parts(value: Any) -> list[Any]:
-    """The parts of a value, in an order that does not depend on the process."""
-    if is_dataclass(value) and not isinstance(value, type):
-        return [(field.name, getattr(value, field.name)) for field in fields(value)]
-    if isinstance(value, BaseModel):
-        return list(value)
-    if isinstance(value, Mapping):
-        return sorted(value.items(), key=lambda item: repr(item[0]))
-    if isinstance(value, list | tuple | np.ndarray):
-        return list(value)
-    if isinstance(value, Set):
-        return sorted(fingerprint(item) for item in value)
-    if isinstance(value, type) or callable(value):
-        return [getattr(value, "__module__", ""), getattr(value, "__qualname__", "")]
-    return sorted(vars(value).items()) if hasattr(value, "__dict__") else [repr(type(value))]
 
 
 def rays_at_targets(scene: Scene, space: DesignSpace, casters: Sequence[SceneCaster], count: int) -> Rays:

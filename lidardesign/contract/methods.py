@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from lidardesign.contract.law import BrokenLawError, Law, LawHolds, NotApplicable, Tried, fingerprint
+from lidardesign.contract.law import BrokenLawError, Law, LawHolds, NotApplicable, Tried
 from lidardesign.errors import InfeasibleError
 from lidardesign.formats.designs import load_design
 from lidardesign.problem.method import DESIGN, Method, fault_of
@@ -24,6 +24,7 @@ from lidardesign.problem.problem import DesignResult, Problem
 from lidardesign.problem.world import World
 from lidardesign.rays.information import surface_information
 from lidardesign.rays.training_scenes import TrainingScenes
+from lidardesign.run.content import fingerprint
 from lidardesign.scenes.rays import Returns
 from lidardesign.scenes.scene import Body, Scene, Sphere, rigid
 from lidardesign.sensors.design_file import save_design

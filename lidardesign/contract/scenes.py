@@ -23,13 +23,13 @@ from lidardesign.contract.law import (
     LawHolds,
     NotApplicable,
     Subject,
-    fingerprint,
     geometry_fingerprint,
     restore_random_states,
 )
 from lidardesign.errors import ConfigError, LidardesignError
 from lidardesign.plugins import plugin_guard
 from lidardesign.rays.information import informs_rays
+from lidardesign.run.content import fingerprint
 from lidardesign.run.processes import ChildError, ask
 from lidardesign.space import DesignSpace
 from lidardesign.task import Split, scenes_of

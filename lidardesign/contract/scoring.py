@@ -10,7 +10,6 @@ from lidardesign.contract.law import (
     LawHolds,
     NotApplicable,
     Subject,
-    fingerprint,
     full_rays,
     returns_of_rays,
     shuffled,
@@ -18,9 +17,10 @@ from lidardesign.contract.law import (
 )
 from lidardesign.numerics import ROUNDING, SLACK
 from lidardesign.rays.information import checked_information, features_of, informs_rays
+from lidardesign.run.content import fingerprint
 from lidardesign.scenes.rays import Returns
 from lidardesign.scenes.scene import Scene
-from lidardesign.task import Information
+from lidardesign.task import Information, prepares
 
 DENSE, SPARSE = 400, 12
 SEED = 20_253
@@ -107,8 +107,10 @@ def check_best(subject: Subject) -> LawHolds:
     return LawHolds(said, figures)
 
 
-def check_order(subject: Subject) -> LawHolds:
+def check_order(subject: Subject) -> LawHolds | NotApplicable:
     """The order in which rays are listed does not matter."""
+    if prepares(subject.task):
+        return NotApplicable("the task prepares for rays in their order")
     worst = 0.0
     for number, scene in enumerate(subject.looked_at):
         returns = _dense(subject, number)
@@ -144,6 +146,26 @@ def check_untouched(subject: Subject) -> LawHolds:
     if touched:
         raise BrokenLawError(f"score changed the scene {touched[0]!r}", hint=COPIES)
     return LawHolds(f"{len(subject.looked_at)} scenes and their returns are as they were")
+
+
+def check_prepared(subject: Subject) -> LawHolds | NotApplicable:
+    """What is prepared anew, and was not scored by yet, gives the same scores; the scenes are as they were."""
+    if not prepares(subject.task):
+        return NotApplicable("the task has no method prepare")
+    again, worst, limit = subject.new_preparation(), 0.0, ORDER_SHARE * subject.metric.tolerance
+    for number, scene in enumerate(subject.looked_at):
+        returns = subject.returns(number, subject.rays(0, DENSE))
+        first, other = (subject.score(scene, returns, one) for one in (subject.preparation, again))
+        worst = max(worst, abs(other.value - first.value))
+    if worst > limit:
+        raise BrokenLawError(
+            f"preparing again changes the score by {worst:.3g} {subject.metric.unit}",
+            allowed=f"{limit:.3g}",
+            hint="draw random numbers from `seed`, keep nothing between calls, and change no `prepared` in score()",
+        )
+    if subject.touched():
+        raise BrokenLawError(f"prepare changed the scene {subject.touched()[0]!r}", hint=COPIES)
+    return LawHolds(f"changes by at most {worst:.1g} {subject.metric.unit}", {"difference": worst})
 
 
 def check_information(subject: Subject) -> LawHolds | NotApplicable:
@@ -247,6 +269,13 @@ LAWS = (
         "score",
         "scenes and returns are as they were after scoring",
         check_untouched,
+        needs=("scores are numbers",),
+    ),
+    Law(
+        "preparing repeats",
+        "score",
+        "preparing again gives the same scores, and changes no scene",
+        check_prepared,
         needs=("scores are numbers",),
     ),
     Law(

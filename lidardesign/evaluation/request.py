@@ -139,7 +139,9 @@ class EvaluationRequest:
 
     def scorer(self, scenes: Iterable[Scene]) -> TrainingScorer:
         """A scorer of training scenes, under the effects of the evaluation."""
-        return TrainingScorer(self.task, self.metric, self.seed, scenes, self.planner)
+        return TrainingScorer(
+            self.task, self.metric, self.seed, scenes, self.planner, preparation=self.world.preparation
+        )
 
 
 def check_baseline(name: str, *, where: str = "baselines") -> None:

@@ -18,10 +18,10 @@ import numpy as np
 from lidardesign.estimates import HALF_INTERVAL, Estimate, Interval, as_documents, paired_difference
 from lidardesign.evaluation.entries import EffectSummary, StrongestBaseline
 from lidardesign.evaluation.mounting import MountError
+from lidardesign.evaluation.sweep import Accuracy
 from lidardesign.methods.cma import SearchRecord
 from lidardesign.run.arrays import csv_table
 from lidardesign.run.files import write_atomic
-from lidardesign.scoring.sweep import Accuracy
 from lidardesign.task import Metric
 
 # What one would place without a design: a grid over everything, and one cropped to what returns.

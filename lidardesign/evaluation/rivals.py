@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidardesign.errors import InfeasibleError
+from lidardesign.errors import BackgroundNote, InfeasibleError
 from lidardesign.evaluation.entries import SINGLE, Entry
 from lidardesign.evaluation.request import EvaluationRequest
 from lidardesign.methods.cma import SearchRecord
@@ -24,6 +24,7 @@ from lidardesign.scoring.fired import ONE_DEVICE, Devices, Positions, fired
 from lidardesign.sensors.adaptive import AdaptiveRays
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.pattern import TRAVELLED
+from lidardesign.task import prepares
 
 NO_RAYS = Rays(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 2)), np.empty(0), np.empty(0))
 
@@ -130,7 +131,9 @@ def _add(request: EvaluationRequest, found: Rivals, asked: Asked) -> None:
         if matched is None or error.message != NOTHING_FITS:
             raise
         positions = tuple(NO_RAYS for _ in request.conditions)
-    if method.is_redrawn and len(positions[0]):
+    if method.is_redrawn and prepares(request.task):
+        found.note(BackgroundNote(f"{method.name} fires one draw in all scenes, for which the task prepares"))
+    elif method.is_redrawn and len(positions[0]):
         redraw = partial(_redrawn, method, replace(problem, rays=len(positions[0])), rays_of)
     found.entries.append(
         Entry(

@@ -37,7 +37,7 @@ from lidardesign.plugins import plugin_guard
 from lidardesign.run.clock import Progress, phase
 from lidardesign.scenes.scene import Scene, group_numbers
 from lidardesign.scenes.triangles import SecondCasts
-from lidardesign.scoring.fired import Positions, without_each
+from lidardesign.scoring.fired import Positions, assign_devices, without_each
 from lidardesign.scoring.scene_scores import score_scenes, silent_notes
 from lidardesign.sensors.adaptive import AdaptiveRays
 from lidardesign.sensors.compare import outside_notes
@@ -204,6 +204,9 @@ def _score_all(
 ) -> _Scored:
     """Score all entries in all scenes, here or by workers; `known` plans are not made again."""
     jobs = {entry.key: entry for entry in entries}
+    world = request.world if planner is request.planner else replace(request.world, planner=planner)
+    # for misplaced rays as for those in their place
+    lists = [assign_devices(entry.positions, entry.devices) for entry in jobs.values()]
     scenes = score_scenes(
         request.task,
         request.metric,
@@ -214,6 +217,7 @@ def _score_all(
         known,
         progress,
         request.starmap,
+        world.preparation.of(lists, starmap=request.starmap),
     )
     of_entries = zip(*(scene.scores for scene in scenes), strict=True)
     return _Scored(

@@ -24,7 +24,7 @@ from lidardesign.rays.training_scenes import HELD_BACK, TrainingScenes
 from lidardesign.run.yaml import merged
 from lidardesign.scenes.scene import group_numbers
 from lidardesign.scoring.fired import Positions, fired, without_each
-from lidardesign.scoring.scene_scores import TrainingScorer
+from lidardesign.scoring.scene_scores import PREPARE, Preparation, TrainingScorer
 from lidardesign.sensors.adaptive import mean_mbps
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design import DesignSpec
@@ -74,7 +74,15 @@ def held_back_scorer(training: TrainingScenes, planner: Planner | None = None) -
     """The scorer of trials, on training scenes that were held back, under the effects that the first ones call for."""
     run, first = training.run, training.first(HELD_BACK)
     scenes = itertools.chain(first, training.scenes(HELD_BACK, len(first)))
-    return TrainingScorer(run.task, run.metric, training.seed, scenes, planner, plans_once=True)
+    return TrainingScorer(
+        run.task,
+        run.metric,
+        training.seed,
+        scenes,
+        planner,
+        plans_once=True,
+        preparation=Preparation(run.task, training.seed, training.scenes(PREPARE), planner),
+    )
 
 
 def score_trials(trials: Sequence[Trial], scorer: TrainingScorer, count: int) -> None:

@@ -11,7 +11,7 @@ from lidardesign.plugins import plugin_guard
 from lidardesign.rays.training_scenes import TrainingScenes
 from lidardesign.scenes.scene import Scene
 from lidardesign.scoring.fired import ONE_DEVICE, Devices, Positions, assign_devices
-from lidardesign.scoring.scene_scores import TrainingScorer
+from lidardesign.scoring.scene_scores import PREPARE, Preparation, TrainingScorer
 from lidardesign.simulate.plan import Planner
 from lidardesign.space import DesignSpace
 from lidardesign.task import Metric, Task, conditions_of, metric_of
@@ -77,10 +77,21 @@ class World:
         for key in [one for one in self._known if not (isinstance(one, tuple) and one[0] in but)]:
             del self._known[key]
 
+    @cached_property
+    def preparation(self) -> Preparation:
+        """What the task prepares for sets of rays, on scenes that nothing else is made or tried on."""
+        return Preparation(self.task, self.seed, self.scenes(PREPARE), self.planner)
+
     def scorer(self, *, keeps_casters: bool = False) -> TrainingScorer:
         """A scorer of the scenes that were learned from."""
         return TrainingScorer(
-            self.task, self.metric, self.seed, self.learned, self.planner, keeps_casters=keeps_casters
+            self.task,
+            self.metric,
+            self.seed,
+            self.learned,
+            self.planner,
+            keeps_casters=keeps_casters,
+            preparation=self.preparation,
         )
 
     def losses(self, lists: Sequence[Positions], count: int, devices: Devices = ONE_DEVICE) -> list[float]:

@@ -13,9 +13,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from lidardesign.evaluation.sweep import Measurement, Sweep
 from lidardesign.report.figures import LAYOUT
 from lidardesign.run.markup import rendered
-from lidardesign.scoring.sweep import Measurement, Sweep
 
 # Axes span at least so many times their smallest value, and end so far beyond what they show.
 LEAST_SPAN = 4.0

@@ -10,16 +10,21 @@ from __future__ import annotations
 
 import itertools
 import math
+import pickle
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, cached_property
+from typing import Any
 
 import numpy as np
 
 from lidardesign.errors import PluginError
-from lidardesign.plugins import plugin_method
+from lidardesign.plugins import plugin_guard, plugin_method
+from lidardesign.rays.information import FEW_SCENES
 from lidardesign.run.clock import Progress, phase
+from lidardesign.run.content import fingerprint
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import Rays, Returns
 from lidardesign.scenes.scene import Scene
@@ -29,13 +34,16 @@ from lidardesign.sensors.adaptive import AdaptiveRays, returns_of
 from lidardesign.simulate.detector.physics import Physics
 from lidardesign.simulate.plan import EffectPlan, Planner
 from lidardesign.simulate.returns import build_casters, simulate_many
-from lidardesign.task import Metric, Score, Task
+from lidardesign.task import Metric, Score, Task, prepares
 from lidardesign.workers import Starmap
 
 # Rays times frames that are traced together: their returns take 24 bytes each.
 MOST_RETURNS = 4_000_000
 # Frames that are checked for returns from targets; a larger share without any is noted.
 WATCHED, MOST_SILENT = 16, 0.5
+PREPARE = "prepare"  # the purpose of training scenes
+# Sets of rays, beside the present ones, whose preparation is kept: a search tries thousands.
+MOST_KEPT = 200
 
 
 def score_lists(
@@ -45,6 +53,7 @@ def score_lists(
     jobs: Sequence[Positions],
     casters: Sequence[SceneCaster],
     physics: Physics | None = None,
+    prepared: Sequence[Any] | None = None,
 ) -> Iterator[tuple[Score, float]]:
     """Scores of many sets of rays in one scene, in their order, each with its share of the time [s].
 
@@ -58,7 +67,9 @@ def score_lists(
         jobs: The sets of rays.
         casters: One per frame.
         physics: The detector and the effects that are on; None: geometry alone.
+        prepared: What the task prepared for each set of rays; None: nothing.
     """
+    made = iter(prepared or [None] * len(jobs))
     for group in _groups(jobs, scene.frames):
         started = time.perf_counter()
         lists = [rays for positions in group for rays in positions]
@@ -76,7 +87,7 @@ def score_lists(
         for positions in group:
             returns = returns_of(positions, scene, [next(found) for _ in positions])
             started = time.perf_counter()
-            score = checked_score(task, metric, scene, returns)
+            score = checked_score(task, metric, scene, returns, next(made))
             yield score, time.perf_counter() - started + per_ray * _count(positions)
 
 
@@ -112,8 +123,8 @@ def _groups(jobs: Sequence[Positions], frames: int) -> Iterator[list[Positions]]
 
 
 @phase("metric")
-def checked_score(task: Task, metric: Metric, scene: Scene, returns: Sequence[Returns]) -> Score:
-    """The score that a task gives to returns in a scene; a failure has the metric's worst value.
+def checked_score(task: Task, metric: Metric, scene: Scene, returns: Sequence[Returns], prepared: Any = None) -> Score:
+    """The score that a task gives to returns in a scene, by what it prepared; a failure has the metric's worst value.
 
     A value beyond the worst one counts as the worst, so that failing is never better.
 
@@ -122,16 +133,8 @@ def checked_score(task: Task, metric: Metric, scene: Scene, returns: Sequence[Re
             better than the best.
     """
     where = f"task {task.name}, metric {metric.name}, scene {scene.name}"
-    truth = dict(scene.truth)
-    for value in truth.values():
-        if isinstance(value, np.ndarray):
-            value.setflags(write=False)
-    with plugin_method(task.name, "scoring", where):
-        score = task.score(scene, returns)
-    if len(truth) != len(scene.truth) or any(scene.truth.get(name) is not value for name, value in truth.items()):
-        raise PluginError(
-            "score changed scene.truth", where=where, hint="the next design is scored by it: copy it first"
-        )
+    with called_on(task, "score", where, [scene]):
+        score = task.score(scene, returns, **({"prepared": prepared} if prepares(task) else {}))
     if not isinstance(score, Score):
         raise PluginError(f"score returned {type(score).__name__}", where=where, allowed="lidardesign.task.Score")
     items = score.details.items() if isinstance(score.details, Mapping) else [(None, None)]
@@ -159,6 +162,25 @@ def checked_score(task: Task, metric: Metric, scene: Scene, returns: Sequence[Re
         )
     clip = min if metric.better == "lower" else max
     return Score(clip(float(score.value), float(metric.worst)), details=dict(score.details))
+
+
+@contextmanager
+def called_on(task: Task, method: str, where: str, scenes: Sequence[Scene]) -> Iterator[None]:
+    """Run a method of a task on scenes, whose truth it has to leave as it is.
+
+    Raises:
+        PluginError: It raised, or changed the truth.
+    """
+    truths = [dict(scene.truth) for scene in scenes]
+    for value in (value for truth in truths for value in truth.values() if isinstance(value, np.ndarray)):
+        value.setflags(write=False)
+    with plugin_method(task.name, method, where):
+        yield
+    for scene, truth in zip(scenes, truths, strict=True):
+        if len(truth) != len(scene.truth) or any(scene.truth.get(name) is not value for name, value in truth.items()):
+            raise PluginError(
+                f"{method} changed scene.truth", where=where, hint="the next design is scored by it: copy it first"
+            )
 
 
 def _is_number(value: object) -> bool:
@@ -219,6 +241,7 @@ def score_scenes(
     plans: Sequence[EffectPlan] = (),
     progress: Progress | None = None,
     starmap: Starmap = itertools.starmap,
+    prepared: Sequence[Any] | None = None,
 ) -> list[SceneScores]:
     """Score scene by scene, so that only one scene's casters are held at a time; or by workers, to the same numbers.
 
@@ -232,10 +255,11 @@ def score_scenes(
         plans: The plan of every scene where it is known already; empty: they are made.
         progress: Called with the name of the scene, the scenes done, and all scenes.
         starmap: Map over scenes.
+        prepared: What the task prepared for each set of rays; None: nothing.
     """
     found, total = [], len(scenes)
     asked = (
-        (task, metric, scene, list(fired(number)), planner, plan, seed)
+        (task, metric, scene, list(fired(number)), planner, plan, seed, prepared)
         for number, (scene, plan) in enumerate(zip(scenes, plans or [None] * total, strict=True))
     )
     results = iter(starmap(score_in_scene, asked))
@@ -256,6 +280,7 @@ def score_in_scene(
     planner: Planner,
     known: EffectPlan | None,
     seed: int,
+    prepared: Sequence[Any] | None = None,
 ) -> SceneScores:
     """Score sets of rays in one scene.
 
@@ -267,6 +292,7 @@ def score_in_scene(
         planner: How effects are chosen.
         known: The plan; None makes it for all the rays together.
         seed: Root of the effects' random streams.
+        prepared: What the task prepared for each of them; None: nothing.
 
     Raises:
         ConfigError: An effect that was named cannot be simulated here, or a gate lies outside the histogram.
@@ -279,9 +305,95 @@ def score_in_scene(
     return SceneScores(
         plan,
         seconds,
-        list(score_lists(task, metric, scene, lists, casters, planner.physics(plan, seed))),
+        list(score_lists(task, metric, scene, lists, casters, planner.physics(plan, seed), prepared)),
         sum((caster.second_casts for caster in casters), SecondCasts()),
     )
+
+
+class Preparation:
+    """What a task prepares for sets of rays on training scenes, once for each, and kept by content.
+
+    It is kept in memory, never in a file: it may be any object, and reading a file of any object may run code.
+
+    Arguments:
+        task: The task.
+        seed: Root of its random numbers, and of the effects'.
+        scenes: Training scenes, of which it gets the first `FEW_SCENES`.
+        planner: The detector, and how effects are chosen, by the rays that come first; None: geometry alone.
+    """
+
+    def __init__(self, task: Task, seed: int, scenes: Iterable[Scene], planner: Planner | None) -> None:
+        self.task, self.seed, self.planner, self._stream = task, seed, planner, scenes
+        self._plans: list[EffectPlan | None] = []
+        self._known: dict[str, Any] = {}
+
+    @cached_property
+    def scenes(self) -> tuple[Scene, ...]:
+        """The scenes that the task gets."""
+        return tuple(itertools.islice(self._stream, FEW_SCENES))
+
+    def of(
+        self, lists: Sequence[Positions], plan: EffectPlan | None = None, starmap: Starmap = itertools.starmap
+    ) -> list[Any]:
+        """What is prepared for each set of rays, in their order; None where the task prepares nothing.
+
+        Arguments:
+            lists: The sets of rays.
+            plan: The effects in all scenes; None: those that each calls for.
+            starmap: Map over scenes, and over sets of rays.
+
+        Raises:
+            PluginError: The task's `prepare` raised, changed the truth, or returned nothing, or what cannot be pickled.
+        """
+        if not prepares(self.task):
+            return [None] * len(lists)
+        if not self._plans:
+            sensed = ((scene, [rays for one in lists for rays in one]) for scene in self.scenes)
+            is_known = plan is not None or self.planner is None
+            self._plans = [plan] * len(self.scenes) if is_known else [*starmap(self.planner.plan, sensed)]
+        # a tuple of patterns counts by its rays alone
+        keys = [fingerprint([[*one], getattr(one, "rule", None)]) for one in lists]
+        missing = {key: one for key, one in zip(keys, lists, strict=True) if key not in self._known}
+        asked = ((self.task, self.scenes, self._plans, one, self.seed, self.planner) for one in missing.values())
+        self._known |= zip(missing, starmap(prepare_for, asked), strict=True)
+        found = {key: self._known.pop(key) for key in dict.fromkeys(keys)}
+        self._known = dict([*self._known.items()][-MOST_KEPT:]) | found
+        return [found[key] for key in keys]
+
+
+@phase("prepare")
+def prepare_for(
+    task: Task,
+    scenes: Sequence[Scene],
+    plans: Sequence[EffectPlan | None],
+    positions: Positions,
+    seed: int,
+    planner: Planner | None,
+) -> Any:
+    """What a task prepares for one set of rays, with the plan of each scene; the rest as of `Preparation`."""
+    returns = []
+    for scene, plan in zip(scenes, plans, strict=True):
+        physics = planner.physics(plan, seed) if planner and plan else None
+        returns.append(returns_in_scene(scene, positions, build_casters(scene), physics))
+    return _checked_preparation(task, scenes, returns, seed)
+
+
+def _checked_preparation(task: Task, scenes: Sequence[Scene], returns: Sequence[Sequence[Returns]], seed: int) -> Any:
+    """What a task prepares from returns, as another process gets it: scores by workers are the same."""
+    where = f"task {task.name}"
+    with called_on(task, "prepare", where, scenes):
+        made = task.prepare(scenes, returns, seed)
+    if made is None:
+        raise PluginError("prepare returned nothing", where=where, hint="return what score() gets as `prepared`")
+    try:
+        with plugin_guard(task.name):
+            return pickle.loads(pickle.dumps(made))
+    except PluginError as error:
+        raise PluginError(
+            f"prepare returned a {type(made).__name__} that cannot be pickled: {error.message}",
+            where=where,
+            hint="workers get it: return arrays, or objects of classes at the top of a module",
+        ) from error
 
 
 class TrainingScorer:
@@ -298,6 +410,7 @@ class TrainingScorer:
         plans_once: Whether the first scene says so for all, and multipath light, which takes a thousand times as long
             as other effects, is left out.
         keeps_casters: Whether the casters of all scenes are kept, for many sets one after the other.
+        preparation: What the task prepares for sets of rays; None: nothing.
 
     `plans` has the effects by the number of the scene.
     """
@@ -312,12 +425,13 @@ class TrainingScorer:
         *,
         plans_once: bool = False,
         keeps_casters: bool = False,
+        preparation: Preparation | None = None,
     ) -> None:
         self.task, self.metric, self.seed, self.planner = task, metric, seed, planner
         self.plans: dict[int, EffectPlan] = {}
         self._drawn: list[Scene] = []
         self._further = iter(scenes)
-        self._plans_once = plans_once
+        self._plans_once, self._preparation = plans_once, preparation
         self._casters = cache(build_casters) if keeps_casters else build_casters
 
     def scenes(self, count: int) -> list[Scene]:
@@ -342,7 +456,9 @@ class TrainingScorer:
         scene = self.scenes(number + 1)[number]
         casters = self._casters(scene)
         physics = self._physics(number, planned or lists, casters)
-        found = score_lists(self.task, self.metric, scene, lists, casters, physics)
+        plan = self.plans.get(0) if self._plans_once else None
+        prepared = None if self._preparation is None else self._preparation.of(lists, plan)
+        found = score_lists(self.task, self.metric, scene, lists, casters, physics, prepared)
         return [score.value for score, _ in found]
 
     def _physics(self, number: int, lists: Sequence[Positions], casters: Sequence[SceneCaster]) -> Physics | None:

@@ -30,7 +30,7 @@ from lidardesign.run_folder import ignore
 from lidardesign.samples import load_samples
 from lidardesign.scenes.scene import Scene, group_numbers
 from lidardesign.scoring.fired import fired
-from lidardesign.scoring.scene_scores import TrainingScorer
+from lidardesign.scoring.scene_scores import PREPARE, Preparation, TrainingScorer
 from lidardesign.sensors.adaptive import mean_mbps
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.space import observed_point
@@ -355,9 +355,15 @@ class Studio:
     def _new_scorer(self, detector: str, settings: tuple[str, ...]) -> TrainingScorer:
         """A scorer of training scenes that no fit chooses on, the same for all designs; others are left for scores."""
         run = self.run.with_settings(settings)
-        scenes = TrainingScenes(run, run.config.seed).scenes(PURPOSE)
-        planner = Measuring(detector).planner(run.metric)
-        return TrainingScorer(run.task, self.run.metric, run.config.seed, scenes, planner)
+        training, planner = TrainingScenes(run, run.config.seed), Measuring(detector).planner(run.metric)
+        return TrainingScorer(
+            run.task,
+            self.run.metric,
+            training.seed,
+            training.scenes(PURPOSE),
+            planner,
+            preparation=Preparation(run.task, training.seed, training.scenes(PREPARE), planner),
+        )
 
     def _scores_of(self, design: Design, detector: str, settings: tuple[str, ...]) -> np.ndarray:
         """The score of a design in each of these scenes."""

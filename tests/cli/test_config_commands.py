@@ -229,7 +229,7 @@ def test_what_evaluate_prints_is_valid_and_complete(lidardesign, flat):
 
 
 def test_the_rungs_of_accuracy_are_those_of_the_schema():
-    from lidardesign.scoring.sweep import Measurement, Sweep
+    from lidardesign.evaluation.sweep import Measurement, Sweep
 
     measurements = [
         Measurement("4", 0.1, 0.01, 2.0, values={"gap_mm": 1.0}),

@@ -13,8 +13,9 @@ from support.plugins import GOOD
 
 from lidardesign.contract import BrokenLawError, check_task, contract_of
 from lidardesign.contract.contract import LAWS
-from lidardesign.contract.law import fingerprint, geometry_fingerprint
+from lidardesign.contract.law import geometry_fingerprint
 from lidardesign.errors import ConfigError, PluginError
+from lidardesign.run.content import fingerprint
 from lidardesign.scenes.scene import Body, Medium, Mesh, Scene, Sphere
 from lidardesign.task import load_task, mount_of
 
@@ -33,6 +34,14 @@ INFORMS = """    def informs(self, scene, returns):
         ray = np.flatnonzero(returns[0].returned)
         return Information(ray, 0 * ray, np.ones(len(ray)), np.zeros(1, dtype=int))
 
+"""
+# A score by what was learned, before which there may be a call of something else.
+LEARNS = """    def prepare(self, scenes, returns, seed):
+        self.calls = getattr(self, "calls", 0) + 1
+        return {"shift": 0.0}
+
+    def score(self, scene, returns, prepared):
+        return Score(20.0 + prepared["shift"])
 """
 # What a task is changed into, by the law that it then breaks: words that are replaced, and what is said of it.
 BROKEN = {
@@ -100,6 +109,12 @@ BROKEN = {
         (VALUE, "        returns[0].range_m[:] = 1.0\n" + VALUE, "score changed returns"),
         (VALUE, "        scene.bodies[0].poses[0, 3] += 1e-9\n" + VALUE, "score changed the scene 'train 0'"),
     ],
+    "preparing repeats": [
+        (SCORE, LEARNS.replace(": 0.0", ": self.calls"), "preparing again changes the score by"),
+        (SCORE, LEARNS.replace("return Score", "prepared['shift'] += 1\n        return Score"), "preparing again"),
+        (SCORE, LEARNS.replace("self.calls =", "scenes[0].bodies[0].poses[0, 3] += 1e-9\n        self.calls ="),
+         "prepare changed the scene 'train 0'"),
+    ],
     "returns inform": [
         (SCORE, INFORMS.replace("Information(", "print(").replace("import print", "import Information") + SCORE,
          "informs returned NoneType"),
@@ -115,6 +130,7 @@ BROKEN = {
     "no global random state": [
         (VALUE, "        np.random.uniform()\n" + VALUE, "numpy's random in score"),
         (VALUE, "        import random; random.random()\n" + VALUE, "Python's random in score"),
+        (SCORE, LEARNS.replace("self.calls =", "self.calls = np.random.uniform() +"), "numpy's random in prepare"),
     ],
 }  # fmt: skip
 # Laws whose breakers replace several words at once.
@@ -157,7 +173,7 @@ def test_a_task_that_breaks_a_law_is_told_so(law, source, words, tmp_path, monke
 def test_a_good_task_keeps_every_law_that_applies():
     kept = {finding.law: finding for finding in contract_of(task_of(GOOD.replace(SCORE, INFORMS + SCORE))).findings()}
     skipped = {finding.law for finding in kept.values() if finding.outcome == "skip"}
-    assert skipped == {"conditions lie in the space", "scenes repeat elsewhere"}
+    assert skipped == {"conditions lie in the space", "scenes repeat elsewhere", "preparing repeats"}
     assert not [finding for finding in kept.values() if finding.outcome == "fail"]
     assert kept["best on the truth"].figures["dense"] < kept["best on the truth"].figures["none"]
     assert contract_of(task_of(GOOD)).finding("returns inform").outcome == "skip"

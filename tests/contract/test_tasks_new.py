@@ -90,7 +90,7 @@ def test_checking_the_installed_task_prints_what_the_guide_says(environment, tmp
 def test_the_example_shows_every_law_as_kept():
     shown = "\n".join(shown_check(EXAMPLE / "README.md", "landing"))
     assert re.findall(r"^│ (\w.*?) +│ (\w+) │", shown, re.MULTILINE) == [
-        (name, "pass") for name in (LOADS[0], *(law.name for law in LAWS))
+        (name, "skip" if name == "preparing repeats" else "pass") for name in (LOADS[0], *(law.name for law in LAWS))
     ]
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+import sys
 from pathlib import Path
+from types import ModuleType
 from typing import get_args
 
 import numpy as np
@@ -11,6 +13,7 @@ import pytest
 
 from lidardesign.config import resolve
 from lidardesign.constraints.document import Constraints
+from lidardesign.contract import check_task
 from lidardesign.errors import LidardesignError
 from lidardesign.run.yaml import parse_yaml
 from lidardesign.scenes.rays import Rays
@@ -181,6 +184,20 @@ def test_the_guide_shows_the_short_method_and_format_of_the_example_package():
         code = (package / f"{name}.py").read_text(encoding="utf-8")
         assert code in blocks("python", WRITING_METHODS)
         assert len(code.splitlines()) <= 35
+
+
+def test_the_distance_of_the_guide_is_learned_and_keeps_every_law(monkeypatch):
+    passing, distance = ModuleType("my_tasks.passing"), {"__name__": "__main__"}
+    exec(blocks("python", WRITING_TASKS)[0], vars(passing))  # the page's own text
+    monkeypatch.setitem(sys.modules, "my_tasks", ModuleType("my_tasks"))
+    monkeypatch.setitem(sys.modules, "my_tasks.passing", passing)
+    exec(blocks("python", WRITING_TASKS)[2], distance)
+    kept = {one.law: one for one in check_task(distance["DistanceTask"]())}
+    assert {law for law, one in kept.items() if one.outcome == "skip"} == {
+        "conditions lie in the space", "scenes repeat elsewhere", "order does not matter",
+    }  # fmt: skip
+    assert "prepare_s" in kept["within time"].figures
+    assert kept["best on the truth"].figures["dense"] < 5.0
 
 
 @pytest.mark.parametrize("page", [ROOT / "README.md", *sorted(DOCS.glob("*.md"))], ids=lambda p: p.name)

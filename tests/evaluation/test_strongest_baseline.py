@@ -24,11 +24,11 @@ HELD_BACK = scenes(31, 40, side=0.3)
 
 
 class HeldBackAlone:
-    """Training scenes of a run, of which none may be asked for but those that no choice was made on."""
+    """Training scenes of a run, of which none may be drawn but those that no choice was made on."""
 
-    def scenes(self, purpose):
-        assert purpose == "held back"
-        return iter(HELD_BACK)
+    def scenes(self, purpose, start=0):
+        assert (purpose, start) == ("held back", 0)
+        yield from HELD_BACK
 
 
 def with_held_back(**changes):

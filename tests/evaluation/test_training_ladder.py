@@ -23,8 +23,8 @@ from lidardesign.evaluation.accuracy import evaluation as accuracy
 from lidardesign.evaluation.accuracy import fields, training
 from lidardesign.evaluation.accuracy.probes import AccuracyRequest
 from lidardesign.evaluation.request import EvaluationRequest
+from lidardesign.evaluation.sweep import Accuracy
 from lidardesign.run.manifest import start_manifest
-from lidardesign.scoring.sweep import Accuracy
 from lidardesign.task import load_task, random_generator, scenes_of
 
 SMALL = (

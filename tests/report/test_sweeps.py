@@ -7,6 +7,7 @@ import mmap
 import plotly.graph_objects as go
 import pytest
 
+from lidardesign.evaluation.sweep import Measurement, Sweep, timed
 from lidardesign.report.pareto import (
     ABOVE_PX,
     BELOW_PX,
@@ -17,7 +18,6 @@ from lidardesign.report.pareto import (
     panels,
     pareto_figures,
 )
-from lidardesign.scoring.sweep import Measurement, Sweep, timed
 
 NASTY = "</script><img src=x onerror=alert(1)>$x^2"
 

@@ -18,7 +18,7 @@ from lidardesign_tasks.surroundings import fog
 from lidardesign_tasks.warehouse import WarehouseTask
 from support.rays import rays_along
 
-from lidardesign.contract.law import fingerprint
+from lidardesign.run.content import fingerprint
 from lidardesign.scenes.casting import shared_caster
 from lidardesign.scenes.scene import Ambient
 from lidardesign.simulate.detector.files import load_detector

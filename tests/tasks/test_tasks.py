@@ -20,10 +20,10 @@ from support.rays import rays_of_points
 
 from lidardesign.contract import contract_of
 from lidardesign.contract.contract import LAWS
-from lidardesign.contract.law import fingerprint
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.rays.coverage import InformedScene, gather
 from lidardesign.rays.information import checked_information
+from lidardesign.run.content import fingerprint
 from lidardesign.scenes.rays import Outcome, Rays, Returns
 from lidardesign.scenes.scene import Scene, group_numbers
 from lidardesign.simulate.returns import simulate

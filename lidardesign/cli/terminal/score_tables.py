@@ -13,7 +13,7 @@ from lidardesign.run.markup import plain_number
 
 if TYPE_CHECKING:
     from lidardesign.evaluation.results import Evaluation
-    from lidardesign.scoring.sweep import Accuracy, Measurement, Sweep
+    from lidardesign.evaluation.sweep import Accuracy, Measurement, Sweep
 
 
 Entry = dict[str, Any]

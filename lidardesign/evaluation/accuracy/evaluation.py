@@ -19,13 +19,13 @@ from lidardesign.evaluation.accuracy import fields, training
 from lidardesign.evaluation.accuracy.probes import AccuracyRequest
 from lidardesign.evaluation.request import EvaluationRequest, numbers_fired
 from lidardesign.evaluation.results import Row
+from lidardesign.evaluation.sweep import Accuracy, Measurement, Sweep, timed, with_memory
 from lidardesign.run.clock import Progress, phase
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import path_windows
 from lidardesign.scenes.scene import Scene
 from lidardesign.scoring.fired import Positions, fired
 from lidardesign.scoring.scene_scores import score_lists
-from lidardesign.scoring.sweep import Accuracy, Measurement, Sweep, timed, with_memory
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.detector.physics import EFFECTS, Detector, Physics, check_windows
@@ -117,7 +117,15 @@ class Bench:
         """The score in a scene under some effects; random numbers are the same whatever the effects."""
         physics = Physics(detector, effects, self.request.seed) if effects else None
         scene, casters = self.scenes[number], self.casters[number]
-        ((score, _),) = score_lists(self.request.task, self.request.metric, scene, [self.positions], casters, physics)
+        ((score, _),) = score_lists(
+            self.request.task,
+            self.request.metric,
+            scene,
+            [self.positions],
+            casters,
+            physics,
+            self.request.world.preparation.of([self.positions]),
+        )
         return score.value
 
     def scores(self, effects: frozenset[str], detector: Detector) -> np.ndarray:

@@ -25,9 +25,9 @@ from lidardesign.density.objective.surfaces import SceneTable, raycast
 from lidardesign.density.objective.target import PADDING_SIGMAS, Target, build_target
 from lidardesign.density.objective.visibility import Columns, NoVisibility, Optics, RayBatch, Unmoved, Visibility
 from lidardesign.evaluation.accuracy.probes import AccuracyRequest, Probes, density_sweep, draw_probes, few_columns
+from lidardesign.evaluation.sweep import Measurement, Sweep, timed
 from lidardesign.numerics import logsumexp
 from lidardesign.scenes.scene import Body, Mesh, Scene, inverse_rigid
-from lidardesign.scoring.sweep import Measurement, Sweep, timed
 from lidardesign.space import DesignSpace
 
 # Grid points of fields. The more scenes, the more their errors average out; so many can be built at every resolution.

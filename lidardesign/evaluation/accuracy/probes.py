@@ -20,9 +20,9 @@ from lidardesign.density.training.losses import Pool
 from lidardesign.density.training.quality import misplaced_share
 from lidardesign.evaluation.request import EvaluationRequest
 from lidardesign.evaluation.results import Evaluation
+from lidardesign.evaluation.sweep import Measurement, Sweep
 from lidardesign.run.manifest import read_manifest
 from lidardesign.scenes.scene import Scene
-from lidardesign.scoring.sweep import Measurement, Sweep
 from lidardesign.task import random_generator
 
 # Each of a density's choices may misplace a fiftieth of its mass: half of what the best learned flows miss it by.

@@ -19,7 +19,7 @@ from lidardesign.density.training.learned import (
     remeasured,
 )
 from lidardesign.evaluation.accuracy.probes import AccuracyRequest, density_sweep
-from lidardesign.scoring.sweep import Measurement, Sweep, timed
+from lidardesign.evaluation.sweep import Measurement, Sweep, timed
 from lidardesign.task import random_generator
 
 # A misplaced share of a tenth is then known to 5 %.
