@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
 
@@ -32,8 +32,7 @@ from lidardesign.parts.catalogue import Pose
 from lidardesign.parts.part import Part, to_angles, to_directions
 from lidardesign.rays import kernels
 from lidardesign.rays.coverage import Coverage, gather
-from lidardesign.rays.information import choosing
-from lidardesign.rays.training_scenes import InformedScene
+from lidardesign.rays.training_scenes import InformedScene, Informs
 from lidardesign.run.clock import phase
 from lidardesign.scenes.rays import Rays, Returns
 from lidardesign.scenes.scene import Scene
@@ -42,7 +41,7 @@ from lidardesign.sensors.sensor import boresight_frame, boresight_of
 from lidardesign.simulate.detector.physics import IDEAL, Detector, Physics
 from lidardesign.simulate.returns import build_casters, simulate_many
 from lidardesign.space import RANGE, DesignSpace, angles
-from lidardesign.task import Information, random_generator
+from lidardesign.task import random_generator
 
 # What constraints may ask of a part, which it keeps or does not.
 BOUNDED = ("field_of_view.horizontal_deg", "field_of_view.vertical_deg", "gate.start_m", "gate.end_m", "gate.width_m")
@@ -247,7 +246,7 @@ class PartBundle:
 def parts_inform(
     bundle: PartBundle,
     scenes: Iterable[Scene],
-    informs: Callable[[Scene, Sequence[Returns]], Information],
+    informs: Informs,
     count: int,
     seed: int,
     *,
@@ -275,9 +274,8 @@ def parts_inform(
     times = fired / np.minimum(fired, bundle.most_pattern)
     share, told = min(count * bundle.usual_rays / len(rays), 1.0), []
     for number, scene in enumerate(scenes, first_scene):
-        with choosing(share):
-            returns = bundle.returns(scene)
-            informed = InformedScene.of(informs(scene, returns), returns)
+        returns = bundle.returns(scene)
+        informed = InformedScene.of(informs(scene, returns, share), returns)
         informed = _fewer_items(informed, random_generator(seed, "items of parts", number))
         order = np.argsort(informed.ray, kind="stable")
         start = np.concatenate([[0], np.cumsum(np.bincount(informed.ray, minlength=len(rays)))])

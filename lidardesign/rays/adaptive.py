@@ -22,7 +22,7 @@ import numpy as np
 from lidardesign.numerics import SLACK, TINY
 from lidardesign.rays.choice import Choice, choose, choose_within
 from lidardesign.rays.coverage import Coverage
-from lidardesign.rays.information import checked_information, choosing
+from lidardesign.rays.information import checked_information
 from lidardesign.rays.selection import Selection
 from lidardesign.rays.training_scenes import CHOICE, InformedScene, TrainingScenes
 from lidardesign.run.clock import phase
@@ -90,9 +90,8 @@ def frames_of_scene(
     number: int,
 ) -> Frames:
     """The frames of a scene; the first has no frame before, whose features then are not a number."""
-    with choosing(share):
-        returns = simulate_many(scene, [rays])[0]
-        information = checked_information(task, scene, returns)
+    returns = simulate_many(scene, [rays])[0]
+    information = checked_information(task, scene, returns, share)
     informed = [
         InformedScene.of(_of_frame(information, frame), [one]).with_fewer_items(
             most_items, random_generator(seed, "items of frames", number, frame)

@@ -11,13 +11,7 @@ from typing import TypeVar
 import numpy as np
 
 from lidardesign.numerics import systematic_draw
-from lidardesign.rays.information import (
-    CHOSEN_SHARE,
-    FEW_SCENES,
-    MOST_ITEMS,
-    checked_information,
-    choosing,
-)
+from lidardesign.rays.information import CHOSEN_SHARE, FEW_SCENES, MOST_ITEMS, checked_information
 from lidardesign.run.clock import phase
 from lidardesign.run_folder import RunFolder
 from lidardesign.scenes.rays import Outcome, Rays, Returns
@@ -29,7 +23,8 @@ from lidardesign.workers import Starmap
 MARGIN_SIGMAS = 2.0  # by which gates are longer than what training scenes returned, in the density's sigma
 # Chosen on, and held back from the choice.
 CHOICE, HELD_BACK = "choice", "held back"
-Informs = Callable[[Scene, Sequence[Returns]], Information]
+# A task's information of the returns of candidates in a scene, by the share of them that will be chosen.
+Informs = Callable[[Scene, Sequence[Returns], float], Information]
 Found = TypeVar("Found")
 # Scenes are enough once doubling them lowered the loss on scenes held back by less than the first share, and the loss
 # on its own scenes is lower by at most the second; doubling again would gain about a hundredth.
@@ -107,12 +102,11 @@ def informed_scene(
     task: Task, rays: Rays, visits: Sequence[slice], share: float, seed: int, purpose: str, scene: Scene, number: int
 ) -> InformedScene:
     """Information of rays about a random draw of one scene's items."""
-    with choosing(share):
-        found = inform(scene, rays, visits, partial(checked_information, task))
+    found = inform(scene, rays, visits, partial(checked_information, task), share)
     return found.with_fewer_items(MOST_ITEMS, random_generator(seed, "items", purpose, number))
 
 
-def inform(scene: Scene, rays: Rays, visits: Sequence[slice], informs: Informs) -> InformedScene:
+def inform(scene: Scene, rays: Rays, visits: Sequence[slice], informs: Informs, share: float) -> InformedScene:
     """A task's information of the returns of rays in a scene, through the rays' own gates.
 
     Arguments:
@@ -120,10 +114,11 @@ def inform(scene: Scene, rays: Rays, visits: Sequence[slice], informs: Informs) 
         rays: All candidates.
         visits: Slices of the rays at each condition; at the other conditions they have no returns.
         informs: The task's information of a scene's returns.
+        share: The share of the candidates that will be chosen.
     """
     fired = simulate_many(scene, [rays.subset(visit) for visit in visits])
     returns = [pad_returns(rays, visit, frame) for visit, frames in zip(visits, fired, strict=True) for frame in frames]
-    return InformedScene.of(informs(scene, returns), returns)
+    return InformedScene.of(informs(scene, returns, share), returns)
 
 
 def pad_returns(rays: Rays, fired: slice, returns: Returns) -> Returns:

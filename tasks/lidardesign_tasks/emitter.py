@@ -120,9 +120,9 @@ class EmitterTask:
         """Chamfer distance between the reconstruction and the visible part of the face [mm]."""
         return surface_score(self.metric, scene, returns)
 
-    def informs(self, scene: Scene, returns: Sequence[Returns]) -> Information:
+    def informs(self, scene: Scene, returns: Sequence[Returns], share: float) -> Information:
         """Information of returns about points of the visible face, larger for nearer points."""
-        return surface_informs(scene, returns)
+        return surface_informs(scene, returns, share)
 
 
 def winding_number(mesh: Mesh, point: np.ndarray) -> float:

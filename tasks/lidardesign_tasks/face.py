@@ -90,9 +90,9 @@ class FaceTask:
         """Chamfer distance between the reconstruction and the visible part of the face [mm]."""
         return surface_score(self.metric, scene, returns)
 
-    def informs(self, scene: Scene, returns: Sequence[Returns]) -> Information:
+    def informs(self, scene: Scene, returns: Sequence[Returns], share: float) -> Information:
         """Information of returns about points of the visible face, larger for nearer points."""
-        return surface_informs(scene, returns)
+        return surface_informs(scene, returns, share)
 
 
 def head_scenes(

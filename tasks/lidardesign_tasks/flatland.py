@@ -83,13 +83,14 @@ class FlatlandTask:
         value = MILLIMETRES * chamfer_m(curve, scene.truth["curve_m"])
         return Score(min(value, self.metric.worst), details={"returns": float(len(points))})
 
-    def informs(self, scene: Scene, returns: Sequence[Returns]) -> Information:
+    def informs(self, scene: Scene, returns: Sequence[Returns], share: float) -> Information:
         """Information of returns about points of the visible curve, larger for nearer points."""
         curve = in_space(scene.truth["curve_m"])
         points = curve[np.linspace(0, len(curve) - 1, min(ITEMS, len(curve))).astype(int)]
         is_target = [body.is_target for body in scene.bodies]
         length_m = TRUTH_STEP_M * len(curve) * len(returns)
-        return surface_information([points] * len(returns), returns, is_target, length_m, dimensions=1)
+        points_m = [points] * len(returns)
+        return surface_information(points_m, returns, is_target, length_m, dimensions=1, share=share)
 
 
 def measured_points(returns: Sequence[Returns]) -> np.ndarray:

@@ -275,10 +275,10 @@ class MeshesTask:
         score = moving_score if SURFACES in scene.truth else surface_score
         return score(scene.truth.get(METRIC, self.metric), scene, _without_known(scene, returns))
 
-    def informs(self, scene: Scene, returns: Sequence[Returns]) -> Information:
+    def informs(self, scene: Scene, returns: Sequence[Returns], share: float) -> Information:
         """Information of returns about points of the visible surface in each frame, larger for nearer points."""
         informs = moving_informs if SURFACES in scene.truth else surface_informs
-        return informs(scene, _without_known(scene, returns))
+        return informs(scene, _without_known(scene, returns), share)
 
 
 def _without_known(scene: Scene, returns: Sequence[Returns]) -> Sequence[Returns]:

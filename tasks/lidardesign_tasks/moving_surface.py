@@ -71,13 +71,13 @@ def moving_score(metric: Metric, scene: Scene, returns: Sequence[Returns]) -> Sc
     return Score(value, failed=failed == len(scores), details={**details, "failed_frames": float(failed)})
 
 
-def moving_informs(scene: Scene, returns: Sequence[Returns]) -> Information:
+def moving_informs(scene: Scene, returns: Sequence[Returns], share: float) -> Information:
     """Information of returns about points of the visible surface of their own frame, see `surface_information`.
 
     A frame without a visible surface has no points, and its returns are ignored.
     """
     count = max(ITEMS // scene.frames, FEWEST_ITEMS)
-    return information_of(fewer_points(scene.truth, count)[SURFACES], scene, returns)
+    return information_of(fewer_points(scene.truth, count)[SURFACES], scene, returns, share)
 
 
 def _frames(scene: Scene, returns: Sequence[Returns]) -> list[tuple[Scene, list[Returns]]]:

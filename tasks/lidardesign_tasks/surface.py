@@ -159,12 +159,14 @@ def surface_score(metric: Metric, scene: Scene, returns: Sequence[Returns]) -> S
     return Score(min(MILLIMETRES * float(missed.mean() + wrong.mean()), metric.worst), details=details)
 
 
-def surface_informs(scene: Scene, returns: Sequence[Returns]) -> Information:
+def surface_informs(scene: Scene, returns: Sequence[Returns], share: float) -> Information:
     """Information of returns about points of the visible surface, see `surface_information`."""
-    return information_of([fewer_points(scene.truth, ITEMS)["surface"]] * scene.frames, scene, returns)
+    return information_of([fewer_points(scene.truth, ITEMS)["surface"]] * scene.frames, scene, returns, share)
 
 
-def information_of(surfaces: Sequence[SurfaceCloud | None], scene: Scene, returns: Sequence[Returns]) -> Information:
+def information_of(
+    surfaces: Sequence[SurfaceCloud | None], scene: Scene, returns: Sequence[Returns], share: float
+) -> Information:
     """Information of returns about points of the visible surface of each frame, None where it has none."""
     points = [np.zeros((0, 3)) if surface is None else surface.points for surface in surfaces]
     counts = [importance_at(scene, places, frame) for frame, places in enumerate(points)]
@@ -175,6 +177,7 @@ def information_of(surfaces: Sequence[SurfaceCloud | None], scene: Scene, return
         [body.is_target for body in scene.bodies],
         sum(area_m2[one.frame] for one in returns),
         weight=[counts[one.frame] for one in returns],
+        share=share,
     )
 
 

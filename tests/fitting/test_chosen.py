@@ -126,7 +126,7 @@ class TestTheCommand:
 
     def test_refuses_rays_that_tell_nothing(self, lidardesign, run, monkeypatch):
         nothing = Information(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(5, int))
-        monkeypatch.setattr(training_scenes, "checked_information", lambda task, scene, returns: nothing)
+        monkeypatch.setattr(training_scenes, "checked_information", lambda *arguments: nothing)
         refused = lidardesign("fit", run, "--rays", 4)
         assert refused.code == 4
         assert "tells anything about 5 training scenes" in refused.err

@@ -181,9 +181,9 @@ class MujocoTask:
         """Score by the metric of the configuration; see `measures`."""
         return score(scene, returns)
 
-    def informs(self, scene: Scene, returns: Sequence[Returns]) -> Information:
+    def informs(self, scene: Scene, returns: Sequence[Returns], share: float) -> Information:
         """Information of returns by the metric of the configuration."""
-        return informs(scene, returns)
+        return informs(scene, returns, share)
 
     def features(self, scene: Scene, returns: Returns) -> np.ndarray:
         """The mean place of what is taken for a target, (3,) [m]; not a number where nothing is."""
