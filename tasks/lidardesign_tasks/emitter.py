@@ -15,11 +15,23 @@ from typing import Annotated, ClassVar
 import numpy as np
 from pydantic import Field, field_validator
 
-from lidardesign.errors import ConfigError
-from lidardesign.scenes.rays import Returns
-from lidardesign.scenes.scene import Mesh, Receiver, Scene, inverse_rigid
-from lidardesign.space import DesignSpace
-from lidardesign.task import Defaults, Information, Interval, Metres, Metric, Score, Split, Vector
+from lidardesign import (
+    ConfigError,
+    Defaults,
+    DesignSpace,
+    Information,
+    Interval,
+    Mesh,
+    Metres,
+    Metric,
+    Receiver,
+    Returns,
+    Scene,
+    Score,
+    Split,
+    Vector,
+    inverse_rigid,
+)
 from lidardesign_tasks.face import FaceTask, HeadConfig, head_scenes
 from lidardesign_tasks.importance import WEIGHING_KEYS
 from lidardesign_tasks.surface import surface_informs, surface_score

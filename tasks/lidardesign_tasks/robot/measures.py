@@ -12,11 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from lidardesign.errors import DataError
-from lidardesign.scenes.rays import Outcome, Returns
-from lidardesign.scenes.scene import Scene
-from lidardesign.space import DesignSpace
-from lidardesign.task import Information, Metric, Score
+from lidardesign import DataError, DesignSpace, Information, Metric, Outcome, Returns, Scene, Score
 from lidardesign_tasks.moving_surface import SURFACES, moving_informs, moving_score, with_moving_truth
 from lidardesign_tasks.robot.targets import Model
 from lidardesign_tasks.robot.tracking import FEWEST_FRAMES, filled_path, path_information, tracked_places

@@ -15,16 +15,16 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import BeforeValidator, Field
 
-from lidardesign.errors import ConfigError
-from lidardesign.scenes.rays import Returns
-from lidardesign.scenes.scene import Scene
-from lidardesign.space import DesignSpace
-from lidardesign.task import (
+from lidardesign import (
+    ConfigError,
     Defaults,
+    DesignSpace,
     FolderConfig,
     Information,
     Interval,
     Metric,
+    Returns,
+    Scene,
     Score,
     Split,
     Vector,
