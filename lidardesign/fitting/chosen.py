@@ -41,7 +41,7 @@ from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.adaptive import AdaptivePatterns
 from lidardesign.sensors.bandwidth import split_budget
 from lidardesign.sensors.pattern import Pattern
-from lidardesign.sensors.sensor import Sensor, interval_factor, tangent_directions
+from lidardesign.sensors.sensor import CENTRING_ROUNDS, Sensor, centred_boresight, interval_factor
 from lidardesign.space import (
     AZIMUTH,
     DIMENSIONS,
@@ -49,14 +49,11 @@ from lidardesign.space import (
     RANGE,
     DesignSpace,
     aim,
-    angles,
     direction,
     observed_point,
 )
 from lidardesign.task import random_generator
 
-# Rounds in which a boresight moves to the middle of its rays: away from the poles it rests after two or three.
-CENTRING_ROUNDS = 8
 # Fields hold their outermost rays, whatever digits of angles a file rounds.
 FIELD_SLACK = COARSE_SLACK / 10
 
@@ -281,8 +278,7 @@ def smallest_field(sensor: Sensor, looking: np.ndarray, rules: SensorRules, spac
         area = float(view[view > 0].prod())
         if (2 * np.abs(tangent).max(axis=0) <= np.minimum(view, widest) + FIELD_SLACK).all() and area < smallest:
             best, smallest = replace(tried, field_of_view_rad=tuple(np.minimum(view, widest).tolist())), area
-        middle = (tangent.min(axis=0) + tangent.max(axis=0)) / 2
-        azimuth, elevation = (float(angle) for angle in angles(tangent_directions(tried.frame, middle[None])[0]))
+        azimuth, elevation = centred_boresight(tried.frame, tangent)
         tried = replace(tried, azimuth_rad=azimuth, elevation_rad=elevation)
     return best
 
