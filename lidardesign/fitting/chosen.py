@@ -34,7 +34,7 @@ from lidardesign.rays.proposals import (
     rays_of_points,
 )
 from lidardesign.rays.selection import Selected, Selection, inform_enough, select
-from lidardesign.rays.training_scenes import CHOICE, HELD_BACK, InformedScene, TrainingScenes
+from lidardesign.rays.training_scenes import CHOICE, HELD_BACK, SceneInformation, TrainingScenes
 from lidardesign.run.clock import phase
 from lidardesign.samples import Samples
 from lidardesign.scenes.rays import Rays
@@ -216,7 +216,7 @@ def _drawn(
 @phase("candidates")
 def _picked(
     pool: CandidatePool, proposals: Proposals, conditions: Sequence[dict[str, float]], count: int, least: np.ndarray
-) -> tuple[list[Rays], list[InformedScene], list[InformedScene]] | None:
+) -> tuple[list[Rays], list[SceneInformation], list[SceneInformation]] | None:
     """The first `count` rays of a pool inside the sensors per condition, with their information; None if too few."""
     number, known, lists = np.full(len(pool.points), -1), 0, []
     for visit, at in zip(pool.visits, conditions, strict=True):

@@ -28,7 +28,7 @@ from lidardesign.rays.certificate import certificate_document, certify
 from lidardesign.rays.choice import Choice, RayCounts, choose
 from lidardesign.rays.coverage import Coverage, gather
 from lidardesign.rays.proposals import CANDIDATES_PER_RAY
-from lidardesign.rays.training_scenes import Informs, inform
+from lidardesign.rays.training_scenes import Informs, information_of
 from lidardesign.run.clock import phase
 from lidardesign.samples import Samples
 from lidardesign.scenes.rays import Rays
@@ -96,7 +96,7 @@ class RingCandidates:
         """Information of some rings, of which a share will be chosen, about `FEW_SCENES` scenes, and its unit."""
         rays = self.rays(rings, np.arange(len(rings)))
         few = itertools.islice(scenes, round(scenes_share * information.FEW_SCENES))
-        informed = [inform(scene, rays, [slice(0, len(rays))], informs, share) for scene in few]
+        informed = [information_of(scene, rays, [slice(0, len(rays))], informs, share) for scene in few]
         table = gather(informed, rays.gate_m[:, None], np.zeros((len(rays), 1)))
         return table.grouped(np.arange(len(rays)).reshape(len(rings), self.points)), informed[0].unit
 
