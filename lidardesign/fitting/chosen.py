@@ -113,7 +113,7 @@ def choose_rays(
     budget, conditions = constraints.budget, training.run.conditions(samples.space)
     placed, may_fail = fitted.sensors, bool(constraints.survive)
     if may_fail:
-        placed = widened(placed, constraints.rules, level, samples)
+        placed = share_fields(placed, constraints.rules, level, samples)
     proposals = Proposals(placed, constraints.rules, level, samples, by_turns=may_fail)
     in_regions = any(sensor.origin_covariance_m2 is not None for sensor in placed)
     wanted = max(CANDIDATES_PER_RAY * counts[-1], LEAST_CANDIDATES_OF_REGIONS if in_regions else 0)
@@ -122,8 +122,8 @@ def choose_rays(
     if len(conditions) > 1:
         # so that patterns along a condition fire as many rays of each sensor everywhere
         least = np.maximum(least, split_budget(weights, counts[-1], each=each_fires))
-    picked = None if pool is None else _picked(pool, proposals, conditions, wanted, least)
-    lists = picked[0] if picked else _drawn(proposals, conditions, wanted, least, training.seed)
+    picked = None if pool is None else _candidates_from_pool(pool, proposals, conditions, wanted, least)
+    lists = picked[0] if picked else _draw_candidates(proposals, conditions, wanted, least, training.seed)
     ends = np.cumsum([0, *map(len, lists)]).tolist()
     admitted = partial(
         admitted_choices,
@@ -204,7 +204,7 @@ def _adaptive(
 
 
 @phase("candidates")
-def _drawn(
+def _draw_candidates(
     proposals: Proposals, conditions: Sequence[dict[str, float]], count: int, least: np.ndarray, seed: int
 ) -> list[Rays]:
     return [
@@ -214,7 +214,7 @@ def _drawn(
 
 
 @phase("candidates")
-def _picked(
+def _candidates_from_pool(
     pool: CandidatePool, proposals: Proposals, conditions: Sequence[dict[str, float]], count: int, least: np.ndarray
 ) -> tuple[list[Rays], list[SceneInformation], list[SceneInformation]] | None:
     """The first `count` rays of a pool inside the sensors per condition, with their information; None if too few."""
@@ -283,15 +283,17 @@ def smallest_field(sensor: Sensor, looking: np.ndarray, rules: SensorRules, spac
     return best
 
 
-def widened(
+def share_fields(
     sensors: Sequence[Sensor], rules: Sequence[SensorRules], level: float, samples: Samples
 ) -> tuple[Sensor, ...]:
     """Sensors of equal shares that see as much of the density as constraints allow, so that each can replace others."""
-    wide = [_widened(sensor, index, rules, level, samples) for index, sensor in enumerate(sensors)]
+    wide = [_with_widest_field(sensor, index, rules, level, samples) for index, sensor in enumerate(sensors)]
     return tuple(replace(sensor, weight=1 / len(wide)) for sensor in wide)
 
 
-def _widened(sensor: Sensor, index: int, rules: Sequence[SensorRules], level: float, samples: Samples) -> Sensor:
+def _with_widest_field(
+    sensor: Sensor, index: int, rules: Sequence[SensorRules], level: float, samples: Samples
+) -> Sensor:
     space, own = samples.space, rules_of(rules, index)
     origins = samples.points[:, :3].copy()
     if sensor.origin_covariance_m2 is None:
