@@ -309,7 +309,7 @@ def _enough_scenes(
             chosen = choose_set(coverage, limits)
         if not chosen.members:
             raise InfeasibleError(
-                "none of the parts tells anything about the scenes",
+                "none of the parts has information about the scenes",
                 where="--parts",
                 hint="parts whose ranges reach the targets, or looser bounds of gate, boresight and origin",
             )

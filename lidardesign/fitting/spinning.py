@@ -138,7 +138,7 @@ def choose_rings(
     with phase("what returns tell"):
         told, _ = first.coverage(every, scenes("choice"), informs, share, FIRST_SHARE)
         if not len(told.item):
-            raise InfeasibleError(f"none of {len(first)} rings tells anything about the training scenes", where=name)
+            raise InfeasibleError(f"none of {len(first)} rings has information about the training scenes", where=name)
         gains = told.gains(np.zeros(len(told.weight)))[:, 0].reshape(-1, elevations).sum(axis=0)
         candidates = replace(first, elevation_rad=refine_elevations(even, gains))
         coverage, unit = candidates.coverage(every, scenes("choice"), informs, share)

@@ -80,7 +80,7 @@ class Selection:
         """
         if not len(coverage.item):
             raise InfeasibleError(
-                f"none of {len(self.rays)} candidate rays tells anything about {scenes} training scenes",
+                f"none of {len(self.rays)} candidate rays has information about {scenes} training scenes",
                 where=self.name,
                 hint="let sensors look at the targets: from another place, constrained less, or learn longer",
             )
