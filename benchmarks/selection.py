@@ -58,7 +58,8 @@ def chosen(options: Any, candidates: int, scenes: int) -> tuple[Any, Any, Any, n
     from lidardesign.rays.choice import RayCounts, choose
     from lidardesign.rays.coverage import gather
     from lidardesign.rays.gates import gate_choices
-    from lidardesign.rays.training_scenes import inform
+    from lidardesign.rays.information import CHOSEN_SHARE
+    from lidardesign.rays.training_scenes import information_of
     from lidardesign.sensors.bandwidth import Bandwidth
 
     task, rays = FaceTask(), even_candidates(face_scenes(options.model, 5), candidates)
@@ -69,7 +70,8 @@ def chosen(options: Any, candidates: int, scenes: int) -> tuple[Any, Any, Any, n
         marks.append(time.process_time())
 
     informed = [
-        inform(scene, rays, [slice(0, len(rays))], task.informs) for scene in training_heads(options.model, scenes)
+        information_of(scene, rays, [slice(0, len(rays))], task.informs, CHOSEN_SHARE)
+        for scene in training_heads(options.model, scenes)
     ]
     mark()
     gates_m = gate_choices(rays, [slice(0, len(rays))], informed, MARGIN_M)
@@ -130,7 +132,8 @@ def proxy_beside_score(options: Any) -> tuple[list[list[object]], float]:
 
     from lidardesign.rays.choice import RayCounts, choose
     from lidardesign.rays.coverage import gather
-    from lidardesign.rays.training_scenes import inform
+    from lidardesign.rays.information import CHOSEN_SHARE
+    from lidardesign.rays.training_scenes import information_of
     from lidardesign.simulate.returns import simulate
 
     task, generator = FaceTask(), np.random.default_rng(0)
@@ -144,7 +147,7 @@ def proxy_beside_score(options: Any) -> tuple[list[list[object]], float]:
     config = task.Config(test=options.proxy[2], **face_settings(options.model))
     held_out = list(task.scenes(config, "test", 0))
     others = [
-        inform(scene, rays, [slice(0, len(rays))], task.informs)
+        information_of(scene, rays, [slice(0, len(rays))], task.informs, CHOSEN_SHARE)
         for scene in face_scenes(options.model, options.proxy[2], seed=7)
     ]
     judged = gather(others, gates_m, coverage.bits)

@@ -22,10 +22,19 @@ if TYPE_CHECKING:
     from lidardesign.api.scores import Scores
     from lidardesign.api.seeds import evaluate_seeds
     from lidardesign.constraints.document import Constraints
+    from lidardesign.errors import BackgroundNote, ConfigError, DataError
     from lidardesign.formats import Format
     from lidardesign.formats.rig import Rig, RigSensor
+    from lidardesign.numerics import circular_difference
     from lidardesign.problem.problem import DesignResult, ray_design
-    from lidardesign.scenes.rays import Rays, Returns
+    from lidardesign.rays.information import scattered_area_m2, surface_information
+    from lidardesign.run import inputs
+    from lidardesign.run.arrays import csv_rows, read_npz
+    from lidardesign.run.validation import suggest
+    from lidardesign.run.yaml import plain_number
+    from lidardesign.scenes import mesh_files, mujoco_models
+    from lidardesign.scenes.casting import SceneCaster
+    from lidardesign.scenes.rays import Outcome, Rays, Returns, rotation_of_quaternion, rotation_of_rpy
     from lidardesign.scenes.scene import (
         Ambient,
         Body,
@@ -38,31 +47,69 @@ if TYPE_CHECKING:
         Plane,
         Receiver,
         Scene,
+        Shape,
+        Sign,
         Sphere,
+        inverse_rigid,
         rigid,
     )
-    from lidardesign.space import DesignSpace
-    from lidardesign.task import Defaults, Information, Metric, Score, Split, Task, TaskConfig, random_generator
+    from lidardesign.scenes.surface import half_extents_m, sample_body, sample_triangles
+    from lidardesign.scoring import metrics
+    from lidardesign.space import AZIMUTH, DIMENSIONS, ELEVATION, FARTHEST_M, RANGE, DesignSpace, aim
+    from lidardesign.task import (
+        Defaults,
+        FolderConfig,
+        Information,
+        Interval,
+        Metres,
+        Metric,
+        Score,
+        Split,
+        Task,
+        TaskConfig,
+        Vector,
+        random_generator,
+    )
 
 __version__ = "0.1.0"
 __all__ = [
-    "Ambient", "Body", "Box", "Capsule", "Constraints", "Cylinder", "Defaults", "Design", "DesignResult", "DesignSpace",
-    "Ellipsoid", "Format", "Information", "Medium", "Mesh", "Metric", "Plane", "Rays", "Receiver", "Returns", "Rig",
-    "RigSensor", "Run", "Scene", "Score", "Scores", "Sphere", "Split", "Task", "TaskConfig", "__version__",
-    "evaluate_seeds", "learn", "load_design", "open_run", "random_generator", "ray_design", "rigid",
+    "AZIMUTH", "DIMENSIONS", "ELEVATION", "FARTHEST_M", "RANGE", "Ambient", "BackgroundNote", "Body", "Box", "Capsule",
+    "ConfigError", "Constraints", "Cylinder", "DataError", "Defaults", "Design", "DesignResult", "DesignSpace",
+    "Ellipsoid", "FolderConfig", "Format", "Information", "Interval", "Medium", "Mesh", "Metres", "Metric", "Outcome",
+    "Plane", "Rays", "Receiver", "Returns", "Rig", "RigSensor", "Run", "Scene", "SceneCaster", "Score", "Scores",
+    "Shape", "Sign", "Sphere", "Split", "Task", "TaskConfig", "Vector", "__version__", "aim", "circular_difference",
+    "csv_rows", "evaluate_seeds", "half_extents_m", "inputs", "inverse_rigid", "learn", "load_design", "mesh_files",
+    "metrics", "mujoco_models", "open_run", "plain_number", "random_generator", "ray_design", "read_npz", "rigid",
+    "rotation_of_quaternion", "rotation_of_rpy", "sample_body", "sample_triangles", "scattered_area_m2", "suggest",
+    "surface_information",
 ]  # fmt: skip
-# Where names are imported from when they are first used; type checkers read the imports above.
+# Where names are imported from when they are first used, also that of a module; type checkers read the imports above.
 _HOMES = {
     "lidardesign.constraints.document": "Constraints",
+    "lidardesign.errors": "BackgroundNote ConfigError DataError",
     "lidardesign.formats": "Format",
     "lidardesign.formats.rig": "Rig RigSensor",
+    "lidardesign.numerics": "circular_difference",
     "lidardesign.problem.problem": "DesignResult ray_design",
-    "lidardesign.scenes.rays": "Rays Returns",
+    "lidardesign.rays.information": "scattered_area_m2 surface_information",
+    "lidardesign.run.arrays": "csv_rows read_npz",
+    "lidardesign.run.inputs": "inputs",
+    "lidardesign.run.validation": "suggest",
+    "lidardesign.run.yaml": "plain_number",
+    "lidardesign.scenes.casting": "SceneCaster",
+    "lidardesign.scenes.mesh_files": "mesh_files",
+    "lidardesign.scenes.mujoco_models": "mujoco_models",
+    "lidardesign.scenes.rays": "Outcome Rays Returns rotation_of_quaternion rotation_of_rpy",
     "lidardesign.scenes.scene": (
-        "Ambient Body Box Capsule Cylinder Ellipsoid Medium Mesh Plane Receiver Scene Sphere rigid"
+        "Ambient Body Box Capsule Cylinder Ellipsoid Medium Mesh Plane Receiver Scene Shape Sign Sphere inverse_rigid"
+        " rigid"
     ),
-    "lidardesign.space": "DesignSpace",
-    "lidardesign.task": "Defaults Information Metric Score Split Task TaskConfig random_generator",
+    "lidardesign.scenes.surface": "half_extents_m sample_body sample_triangles",
+    "lidardesign.scoring.metrics": "metrics",
+    "lidardesign.space": "AZIMUTH DIMENSIONS ELEVATION FARTHEST_M RANGE DesignSpace aim",
+    "lidardesign.task": (
+        "Defaults FolderConfig Information Interval Metres Metric Score Split Task TaskConfig Vector random_generator"
+    ),
     "lidardesign.api.design": "Design",
     "lidardesign.api.scores": "Scores",
     "lidardesign.api.run": "Run learn load_design open_run",
@@ -74,7 +121,8 @@ def _import(name: str) -> Any:
     home = next((home for home, names in _HOMES.items() if name in names.split()), None)
     if home is None:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    globals()[name] = value = getattr(import_module(home), name)
+    module = import_module(home)
+    globals()[name] = value = module if home.endswith(f".{name}") else getattr(module, name)
     return value
 
 

@@ -84,6 +84,31 @@ def figure_and_interval(value: float, low: float | None, high: float | None, *, 
     return f"{figure:{sign}.{decimals}f}", f"{ends[0]:.{decimals}f}", f"{ends[1]:.{decimals}f}"
 
 
+def comparison(difference: Interval, other: str, better: str, unit: str) -> str:
+    """What a design is beside another one: better or worse by how much, or not significantly different.
+
+    Arguments:
+        difference: Its score minus that of the other.
+        other: The other's name.
+        better: Of the metric, `lower` or `higher`.
+        unit: The metric's.
+    """
+    sign = 1.0 if difference.mean > 0 else -1.0
+    word = "better" if (sign < 0) == (better == "lower") else "worse"
+    ends = [None if end is None else sign * end for end in difference[1:]]
+    low, high = ends if None in ends else sorted(ends)
+    if difference.mean == low == high == 0:
+        return f"the same as {other} in every scene"
+    unit = "percentage points" if unit == "%" else unit
+    size, low_text, high_text = figure_and_interval(abs(difference.mean), low, high)
+    by = f"{size} {unit}".rstrip()
+    if low is None:
+        return f"not significantly different from {other} ({by} {word})"
+    if low > 0:
+        return f"{word} than {other} by {by} ({low_text} to {high_text})"
+    return f"not significantly different from {other} ({by} {word}, {low_text} to {high_text})"
+
+
 def standard_error(influence: np.ndarray) -> float:
     """Standard error of a figure from the influences of its samples, shape (N,): sqrt(mean of squares / N)."""
     return float(np.sqrt(np.square(influence).mean() / len(influence))) if len(influence) else 0.0

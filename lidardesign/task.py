@@ -253,6 +253,7 @@ class Task(Protocol):
 
     A task may also give `informs(scene, returns) -> Information`, the information of returns for choosing rays;
     `returns` are as in `score`, of all candidate rays through open gates. Rays of a task without it are not chosen.
+    Where it takes a keyword `share`, it gets the share of the candidates that will be chosen, roughly.
 
     A task may also give `features(scene, returns) -> array`, a few numbers of one frame's returns, always as many, by
     which the pattern of the next frame is picked, as the place of what is tracked; not a number where nothing is known.

@@ -60,14 +60,15 @@ class ScaledFlatlandTask:
             return Score(self.metric.worst, failed=True)
         return Score(min(PERMILLE * chamfer_m(curve, scene.truth["curve_m"]), self.metric.worst))
 
-    def informs(self, scene: Scene, returns: Sequence[Returns]) -> Information:
+    def informs(self, scene: Scene, returns: Sequence[Returns], share: float) -> Information:
         """Flatland's information, of the curve where it was moved to."""
         curve = in_space(scene.truth["curve_m"])
         points = curve[np.linspace(0, len(curve) - 1, min(ITEMS, len(curve))).astype(int)]
         moved = scene.truth["size_m"] * points + scene.truth["offset_m"]
         length_m = scene.truth["size_m"] * TRUTH_STEP_M * len(curve) * len(returns)
         is_target = [body.is_target for body in scene.bodies]
-        return surface_information([moved] * len(returns), returns, is_target, length_m, dimensions=1)
+        points_m = [moved] * len(returns)
+        return surface_information(points_m, returns, is_target, length_m, dimensions=1, share=share)
 
     @staticmethod
     def _home(space: DesignSpace, config: ScaledFlatlandConfig) -> DesignSpace:

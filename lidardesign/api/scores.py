@@ -418,7 +418,7 @@ def evaluation_request(
         designs=[design.specification for design in designs],
         rays=sorted(set(rays)),
         baselines=tuple(dict.fromkeys(baselines)),
-        train=run.scenes("train", seed),
+        train=run.scenes("train", seed) if baselines else (),  # for baselines alone
         test=run.scenes("test", seed if scenes_seed is None else scenes_seed),
         scenes_seed=scenes_seed,
         without_visibility=None

@@ -12,13 +12,13 @@ from lidardesign.clouds.ros import NANOSECONDS
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.evaluation.request import fired_numbers
 from lidardesign.numerics import COARSE_SLACK, SLACK
-from lidardesign.report.scene_figure import own_triangles, scene_bounds
 from lidardesign.run.clock import phase
 from lidardesign.run_folder import RunFolder
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.mesh_files import OTHER_FORMATS, SUFFIXES, Y_UP, load_mesh
 from lidardesign.scenes.rays import Returns
 from lidardesign.scenes.scene import Body, Round, Scene, inverse_rigid
+from lidardesign.scenes.triangulation import own_triangles, scene_bounds
 from lidardesign.scoring.fired import Positions, fired
 from lidardesign.scoring.scene_scores import returns_in_scene
 from lidardesign.sensors.design import DesignSpec

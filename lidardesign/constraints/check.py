@@ -74,7 +74,7 @@ def check_design(document: Mapping[str, Any], constraints: Any, space: Any = Non
     level = float(document.get("level", 0.95))
     z = NormalDist().inv_cdf((1 + level) / 2)
     sensors, each = list(document["sensors"]), list(rules.get("each") or [])
-    own_rules = [_over(rules, each[index]) if index < len(each) else rules for index in range(len(sensors))]
+    own_rules = [_merged(rules, each[index]) if index < len(each) else rules for index in range(len(sensors))]
     checks = _between("sensors", len(sensors), rules.get("sensors"))
     wanted = _get(rules, "sensors", "count")
     if wanted is not None:
@@ -89,18 +89,18 @@ def check_design(document: Mapping[str, Any], constraints: Any, space: Any = Non
         checks += _pattern(pattern, own_rules, bounds)
         # others fire what their part or file says, whose field may be round
         if document.get("layout") in ("chosen", "spinning"):
-            checks += _astray(pattern, sensors, level)
+            checks += _rays_outside_sensors(pattern, sensors, level)
     checks += _mounts(sensors, own_rules) + _parts(document, rules.get("parts"))
     return checks + _budget(document, rules.get("budget") or {})
 
 
-def _over(common: Mapping[str, Any], special: Mapping[str, Any] | None) -> dict[str, Any]:
+def _merged(common: Mapping[str, Any], special: Mapping[str, Any] | None) -> dict[str, Any]:
     """The common keys overridden by an entry of `each`, key by key at every depth."""
     result = dict(common)
     for key, value in (special or {}).items():
         both = isinstance(value, Mapping) and isinstance(result.get(key), Mapping)
         if value is not None:
-            result[key] = _over(result[key], value) if both else value
+            result[key] = _merged(result[key], value) if both else value
     return result
 
 
@@ -286,7 +286,9 @@ def _pattern(
     return [*failed, _within_space("pattern", pattern["dimension"], space, knots[0], knots[-1])]
 
 
-def _astray(pattern: Mapping[str, Any], sensors: Sequence[Mapping[str, Any]], level: float) -> list[ConstraintCheck]:
+def _rays_outside_sensors(
+    pattern: Mapping[str, Any], sensors: Sequence[Mapping[str, Any]], level: float
+) -> list[ConstraintCheck]:
     """Failed checks of listed rays inside their sensor's place or region, field of view and gate, at any knot."""
     owner, failed = np.asarray(pattern["sensor"]), []
     for index, sensor in enumerate(sensors):

@@ -8,38 +8,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 from lidardesign.errors import ThresholdError
-from lidardesign.estimates import figure_and_interval
+from lidardesign.estimates import comparison
 from lidardesign.evaluation.results import BY_HAND, Evaluation, Paired, verdict
 
 
-def comparison(pair: Paired, better: str, unit: str) -> str:
-    """What the first of a pair is beside the second: better or worse by how much, or not significantly different.
-
-    Arguments:
-        pair: The difference.
-        better: Of the metric, `lower` or `higher`.
-        unit: The metric's.
-    """
-    sign = 1.0 if pair.difference > 0 else -1.0
-    word = "better" if (sign < 0) == (better == "lower") else "worse"
-    ends = (None, None) if pair.ci_low is None or pair.ci_high is None else (sign * pair.ci_low, sign * pair.ci_high)
-    low, high = ends if None in ends else sorted(ends)
-    if pair.difference == low == high == 0:
-        return f"the same as {pair.b} in every scene"
-    unit = "percentage points" if unit == "%" else unit
-    size, low_text, high_text = figure_and_interval(abs(pair.difference), low, high)
-    by = f"{size} {unit}".rstrip()
-    if low is None:
-        return f"not significantly different from {pair.b} ({by} {word})"
-    if low > 0:
-        return f"{word} than {pair.b} by {by} ({low_text} to {high_text})"
-    return f"not significantly different from {pair.b} ({by} {word}, {low_text} to {high_text})"
-
-
 def difference_text(pair: Paired, better: str, unit: str) -> str:
-    """A difference as a sentence; arguments as of `comparison`."""
+    """A difference as a sentence, for the metric's direction and unit."""
     rays = f"at {pair.rays} rays" if pair.rays_b in (None, pair.rays) else f"at {pair.rays} and {pair.rays_b} rays"
-    return f"{pair.a} is {comparison(pair, better, unit)} {rays}"
+    return f"{pair.a} is {comparison(pair.interval, pair.b, better, unit)} {rays}"
 
 
 def headline_texts(evaluation: Evaluation) -> list[str]:
@@ -52,7 +28,8 @@ def headline_texts(evaluation: Evaluation) -> list[str]:
         return []
     best = evaluation.best_row
     pairs = {pair.b: pair for pair in evaluation.paired if (pair.a, pair.rays) == (best.design, best.rays)}
-    plain = [comparison(pairs[name], metric.better, metric.unit) for name in BY_HAND if name in pairs]
+    by_hand = [pairs[name] for name in BY_HAND if name in pairs]
+    plain = [comparison(pair.interval, pair.b, metric.better, metric.unit) for pair in by_hand]
     name = best.design if len(rows) == 1 else f"{best.design}, the best design,"
     said = [f"{name} is {' and '.join(plain)} at {best.rays} rays"] if plain else []
     if strongest.name not in BY_HAND and strongest.name in pairs:
@@ -60,7 +37,7 @@ def headline_texts(evaluation: Evaluation) -> list[str]:
         may = "with no more gates"
         if its.gates > best.gates:
             may = f"any rays, with {its.gates} gates for the {best.gates} of {best.design}"
-        against = comparison(pairs[strongest.name], metric.better, metric.unit)
+        against = comparison(pairs[strongest.name].interval, strongest.name, metric.better, metric.unit)
         said.append(
             f"The strongest baseline on training scenes is {strongest.name} ({may}): {best.design} is {against}"
         )

@@ -134,6 +134,11 @@ class Paired(_WithInterval):
     rays_b: int | None = None
     percent: Interval | None = None
 
+    @property
+    def interval(self) -> Interval:
+        """The difference with the ends of its interval."""
+        return Interval(self.difference, self.ci_low, self.ci_high)
+
     def as_dict(self) -> dict[str, Any]:
         """The contract's keys, `half_width` and `percent`, with `rays_b` at equal bandwidth."""
         names = ("a", "b", "rays", "difference", "ci_low", "ci_high", "half_width")

@@ -179,14 +179,14 @@ def _mounting(
     progress: Progress | None,
 ) -> Mounting:
     """The entries at equal rays with mounting errors, under the same effects, and their cost."""
-    careless = [
+    misplaced = [
         replace(entry, name=str(number), redraw=partial(_misplaced, error, entry, request.seed))
         for number, entry in enumerate(entries)
         if entry.matched_to is None
     ]
-    scored = _score_all(request, careless, request.planner, progress, plans)
+    scored = _score_all(request, misplaced, request.planner, progress, plans)
     exact = [row for row in rows if row.matched_to is None]
-    found = [replace(row, design=own.design) for row, own in zip(_rows(request, careless, scored), exact, strict=True)]
+    found = [replace(row, design=own.design) for row, own in zip(_rows(request, misplaced, scored), exact, strict=True)]
     return Mounting(error, found, [_pair(row, own, request.metric) for row, own in zip(found, exact, strict=True)])
 
 

@@ -123,15 +123,15 @@ def _mean_mounting(evaluations: Sequence[Evaluation], exact: Mapping[RowKey, Seq
         return None
     by_key = [{_key(row): row for row in each.rows} for each in mountings]
     metric = evaluations[0].metric
-    careless = {key: [rows[key] for rows in by_key] for key in by_key[0] if key in exact}
+    misplaced = {key: [rows[key] for rows in by_key] for key in by_key[0] if key in exact}
     costs = zip(mountings[0].costs, mountings[0].rows, strict=True)
     return Mounting(
         mountings[0].error,
-        [_mean_row(rows, metric) for rows in careless.values()],
+        [_mean_row(rows, metric) for rows in misplaced.values()],
         [
-            _mean_pair(cost, careless[_key(row)], exact[_key(row)], metric)
+            _mean_pair(cost, misplaced[_key(row)], exact[_key(row)], metric)
             for cost, row in costs
-            if _key(row) in careless
+            if _key(row) in misplaced
         ],
     )
 

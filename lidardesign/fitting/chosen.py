@@ -34,14 +34,14 @@ from lidardesign.rays.proposals import (
     rays_of_points,
 )
 from lidardesign.rays.selection import Selected, Selection, inform_enough, select
-from lidardesign.rays.training_scenes import CHOICE, HELD_BACK, InformedScene, TrainingScenes
+from lidardesign.rays.training_scenes import CHOICE, HELD_BACK, SceneInformation, TrainingScenes
 from lidardesign.run.clock import phase
 from lidardesign.samples import Samples
 from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.adaptive import AdaptivePatterns
 from lidardesign.sensors.bandwidth import split_budget
 from lidardesign.sensors.pattern import Pattern
-from lidardesign.sensors.sensor import Sensor, interval_factor, tangent_directions
+from lidardesign.sensors.sensor import CENTRING_ROUNDS, Sensor, centred_boresight, interval_factor
 from lidardesign.space import (
     AZIMUTH,
     DIMENSIONS,
@@ -49,14 +49,11 @@ from lidardesign.space import (
     RANGE,
     DesignSpace,
     aim,
-    angles,
     direction,
     observed_point,
 )
 from lidardesign.task import random_generator
 
-# Rounds in which a boresight moves to the middle of its rays: away from the poles it rests after two or three.
-CENTRING_ROUNDS = 8
 # Fields hold their outermost rays, whatever digits of angles a file rounds.
 FIELD_SLACK = COARSE_SLACK / 10
 
@@ -116,7 +113,7 @@ def choose_rays(
     budget, conditions = constraints.budget, training.run.conditions(samples.space)
     placed, may_fail = fitted.sensors, bool(constraints.survive)
     if may_fail:
-        placed = widened(placed, constraints.rules, level, samples)
+        placed = share_fields(placed, constraints.rules, level, samples)
     proposals = Proposals(placed, constraints.rules, level, samples, by_turns=may_fail)
     in_regions = any(sensor.origin_covariance_m2 is not None for sensor in placed)
     wanted = max(CANDIDATES_PER_RAY * counts[-1], LEAST_CANDIDATES_OF_REGIONS if in_regions else 0)
@@ -125,8 +122,8 @@ def choose_rays(
     if len(conditions) > 1:
         # so that patterns along a condition fire as many rays of each sensor everywhere
         least = np.maximum(least, split_budget(weights, counts[-1], each=each_fires))
-    picked = None if pool is None else _picked(pool, proposals, conditions, wanted, least)
-    lists = picked[0] if picked else _drawn(proposals, conditions, wanted, least, training.seed)
+    picked = None if pool is None else _candidates_from_pool(pool, proposals, conditions, wanted, least)
+    lists = picked[0] if picked else _draw_candidates(proposals, conditions, wanted, least, training.seed)
     ends = np.cumsum([0, *map(len, lists)]).tolist()
     admitted = partial(
         admitted_choices,
@@ -207,7 +204,7 @@ def _adaptive(
 
 
 @phase("candidates")
-def _drawn(
+def _draw_candidates(
     proposals: Proposals, conditions: Sequence[dict[str, float]], count: int, least: np.ndarray, seed: int
 ) -> list[Rays]:
     return [
@@ -217,9 +214,9 @@ def _drawn(
 
 
 @phase("candidates")
-def _picked(
+def _candidates_from_pool(
     pool: CandidatePool, proposals: Proposals, conditions: Sequence[dict[str, float]], count: int, least: np.ndarray
-) -> tuple[list[Rays], list[InformedScene], list[InformedScene]] | None:
+) -> tuple[list[Rays], list[SceneInformation], list[SceneInformation]] | None:
     """The first `count` rays of a pool inside the sensors per condition, with their information; None if too few."""
     number, known, lists = np.full(len(pool.points), -1), 0, []
     for visit, at in zip(pool.visits, conditions, strict=True):
@@ -281,21 +278,22 @@ def smallest_field(sensor: Sensor, looking: np.ndarray, rules: SensorRules, spac
         area = float(view[view > 0].prod())
         if (2 * np.abs(tangent).max(axis=0) <= np.minimum(view, widest) + FIELD_SLACK).all() and area < smallest:
             best, smallest = replace(tried, field_of_view_rad=tuple(np.minimum(view, widest).tolist())), area
-        middle = (tangent.min(axis=0) + tangent.max(axis=0)) / 2
-        azimuth, elevation = (float(angle) for angle in angles(tangent_directions(tried.frame, middle[None])[0]))
+        azimuth, elevation = centred_boresight(tried.frame, tangent)
         tried = replace(tried, azimuth_rad=azimuth, elevation_rad=elevation)
     return best
 
 
-def widened(
+def share_fields(
     sensors: Sequence[Sensor], rules: Sequence[SensorRules], level: float, samples: Samples
 ) -> tuple[Sensor, ...]:
     """Sensors of equal shares that see as much of the density as constraints allow, so that each can replace others."""
-    wide = [_widened(sensor, index, rules, level, samples) for index, sensor in enumerate(sensors)]
+    wide = [_with_widest_field(sensor, index, rules, level, samples) for index, sensor in enumerate(sensors)]
     return tuple(replace(sensor, weight=1 / len(wide)) for sensor in wide)
 
 
-def _widened(sensor: Sensor, index: int, rules: Sequence[SensorRules], level: float, samples: Samples) -> Sensor:
+def _with_widest_field(
+    sensor: Sensor, index: int, rules: Sequence[SensorRules], level: float, samples: Samples
+) -> Sensor:
     space, own = samples.space, rules_of(rules, index)
     origins = samples.points[:, :3].copy()
     if sensor.origin_covariance_m2 is None:

@@ -383,7 +383,7 @@ class Fitter:
                 design = self._if_better(replace(design, adaptive=chosen.adaptive), notes)
             if chosen.silent > MOST_SILENT:
                 notes.append(
-                    f"no ray tells anything about {chosen.silent:.0%} of the training scenes that were held back; "
+                    f"no ray has information about {chosen.silent:.0%} of the training scenes that were held back; "
                     "if that is unexpected, check that places, directions and gates are right, and in metres"
                 )
             if chosen.shared < LEAST_SHARED:

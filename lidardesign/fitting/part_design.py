@@ -44,7 +44,7 @@ from lidardesign.parts.part import Part
 from lidardesign.rays import information
 from lidardesign.rays.certificate import certificate_document
 from lidardesign.rays.coverage import Coverage
-from lidardesign.rays.training_scenes import CHOICE, HELD_BACK, InformedScene, TrainingScenes, are_enough
+from lidardesign.rays.training_scenes import CHOICE, HELD_BACK, SceneInformation, TrainingScenes, are_enough
 from lidardesign.run.clock import phase
 from lidardesign.samples import Samples
 from lidardesign.scenes.rays import Rays
@@ -288,11 +288,11 @@ def _timed(scenes: Iterable[Found], count: int, label: str, progress: Callable[[
 def _enough_scenes(
     bundle: PartBundle,
     limits: SetLimits,
-    inform: Callable[..., list[InformedScene]],
+    inform: Callable[..., list[SceneInformation]],
     training: TrainingScenes,
     most: int,
     progress: Callable[[str], None],
-) -> tuple[Coverage, ChosenSet, list[InformedScene]]:
+) -> tuple[Coverage, ChosenSet, list[SceneInformation]]:
     """The information of all parts about enough scenes, at most so many, the best set by it, and the scenes.
 
     Raises:
@@ -300,7 +300,7 @@ def _enough_scenes(
     """
     held_back, scenes = training.first(HELD_BACK), training.scenes(CHOICE)
     wanted, loss = information.FEW_SCENES, np.inf
-    informed: list[InformedScene] = []
+    informed: list[SceneInformation] = []
     while True:
         label = f"choosing among {len(bundle.placed)} poses of parts on {wanted} training scenes"
         informed += inform(_timed(scenes, wanted - len(informed), label, progress), first_scene=len(informed))
@@ -309,7 +309,7 @@ def _enough_scenes(
             chosen = choose_set(coverage, limits)
         if not chosen.members:
             raise InfeasibleError(
-                "none of the parts tells anything about the scenes",
+                "none of the parts has information about the scenes",
                 where="--parts",
                 hint="parts whose ranges reach the targets, or looser bounds of gate, boresight and origin",
             )

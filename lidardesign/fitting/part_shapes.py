@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
 
@@ -32,8 +32,7 @@ from lidardesign.parts.catalogue import Pose
 from lidardesign.parts.part import Part, to_angles, to_directions
 from lidardesign.rays import kernels
 from lidardesign.rays.coverage import Coverage, gather
-from lidardesign.rays.information import choosing
-from lidardesign.rays.training_scenes import InformedScene
+from lidardesign.rays.training_scenes import Informs, SceneInformation
 from lidardesign.run.clock import phase
 from lidardesign.scenes.rays import Rays, Returns
 from lidardesign.scenes.scene import Scene
@@ -42,7 +41,7 @@ from lidardesign.sensors.sensor import boresight_frame, boresight_of
 from lidardesign.simulate.detector.physics import IDEAL, Detector, Physics
 from lidardesign.simulate.returns import build_casters, simulate_many
 from lidardesign.space import RANGE, DesignSpace, angles
-from lidardesign.task import Information, random_generator
+from lidardesign.task import random_generator
 
 # What constraints may ask of a part, which it keeps or does not.
 BOUNDED = ("field_of_view.horizontal_deg", "field_of_view.vertical_deg", "gate.start_m", "gate.end_m", "gate.width_m")
@@ -247,13 +246,13 @@ class PartBundle:
 def parts_inform(
     bundle: PartBundle,
     scenes: Iterable[Scene],
-    informs: Callable[[Scene, Sequence[Returns]], Information],
+    informs: Informs,
     count: int,
     seed: int,
     *,
     first_scene: int = 0,
     among: Sequence[int] | None = None,
-) -> list[InformedScene]:
+) -> list[SceneInformation]:
     """Information of every part, as a candidate, about each scene.
 
     Arguments:
@@ -275,9 +274,8 @@ def parts_inform(
     times = fired / np.minimum(fired, bundle.most_pattern)
     share, told = min(count * bundle.usual_rays / len(rays), 1.0), []
     for number, scene in enumerate(scenes, first_scene):
-        with choosing(share):
-            returns = bundle.returns(scene)
-            informed = InformedScene.of(informs(scene, returns), returns)
+        returns = bundle.returns(scene)
+        informed = SceneInformation.of(informs(scene, returns, share), returns)
         informed = _fewer_items(informed, random_generator(seed, "items of parts", number))
         order = np.argsort(informed.ray, kind="stable")
         start = np.concatenate([[0], np.cumsum(np.bincount(informed.ray, minlength=len(rays)))])
@@ -295,12 +293,12 @@ def parts_inform(
     return told
 
 
-def part_table(informed: Sequence[InformedScene], parts: int) -> Coverage:
+def part_table(informed: Sequence[SceneInformation], parts: int) -> Coverage:
     """The table of `parts` parts, each with one open gate, over all items of scenes."""
     return gather(informed, np.tile([0.0, np.inf], (parts, 1, 1)), np.zeros((parts, 1)))
 
 
-def _fewer_items(informed: InformedScene, generator: np.random.Generator) -> InformedScene:
+def _fewer_items(informed: SceneInformation, generator: np.random.Generator) -> SceneInformation:
     """A random draw of the items, without harm, since a part's gate cannot exclude returns."""
     none = {"spoiling": np.zeros(0, np.int32), "harm": np.zeros(0), "harm_range_m": np.zeros(0), "is_repeated": False}
     return replace(informed.with_fewer_items(MOST_ITEMS, generator), **none)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from time import perf_counter
@@ -28,17 +28,16 @@ from lidardesign.rays.certificate import certificate_document, certify
 from lidardesign.rays.choice import Choice, RayCounts, choose
 from lidardesign.rays.coverage import Coverage, gather
 from lidardesign.rays.proposals import CANDIDATES_PER_RAY
-from lidardesign.rays.training_scenes import inform
+from lidardesign.rays.training_scenes import Informs, information_of
 from lidardesign.run.clock import phase
 from lidardesign.samples import Samples
-from lidardesign.scenes.rays import Rays, Returns
+from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Scene
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import MOST_FILE_RAYS
 from lidardesign.sensors.pattern import Pattern
 from lidardesign.sensors.sensor import Sensor
 from lidardesign.space import DesignSpace
-from lidardesign.task import Information
 
 CHANNELS = 16  # of a sensor by default
 POINTS_PER_TURN = 1800  # of a channel: every fifth of a degree, as scanners do at ten turns per second
@@ -90,13 +89,14 @@ class RingCandidates:
         self,
         rings: np.ndarray,
         scenes: Iterator[Scene],
-        informs: Callable[[Scene, Sequence[Returns]], Information],
-        share: float = 1.0,
+        informs: Informs,
+        share: float,
+        scenes_share: float = 1.0,
     ) -> tuple[Coverage, str]:
-        """Information of some rings about a share of the next `FEW_SCENES` scenes, and its unit."""
+        """Information of some rings, of which a share will be chosen, about `FEW_SCENES` scenes, and its unit."""
         rays = self.rays(rings, np.arange(len(rings)))
-        few = itertools.islice(scenes, round(share * information.FEW_SCENES))
-        informed = [inform(scene, rays, [slice(0, len(rays))], informs) for scene in few]
+        few = itertools.islice(scenes, round(scenes_share * information.FEW_SCENES))
+        informed = [information_of(scene, rays, [slice(0, len(rays))], informs, share) for scene in few]
         table = gather(informed, rays.gate_m[:, None], np.zeros((len(rays), 1)))
         return table.grouped(np.arange(len(rays)).reshape(len(rings), self.points)), informed[0].unit
 
@@ -108,7 +108,7 @@ def choose_rings(
     count: int,
     channels: int,
     rays: int | None,
-    informs: Callable[[Scene, Sequence[Returns]], Information],
+    informs: Informs,
     scenes: Callable[[str], Iterator[Scene]],
     name: str,
 ) -> FitResult:
@@ -134,19 +134,19 @@ def choose_rings(
     even, points = ring_grid(space, rays, count, channels)
     first = RingCandidates(places_of(constraints, space), even, points, (space.low[5], space.high[5]))
     elevations = len(even)
-    every = np.arange(len(first))
-    with phase("what returns tell"), information.choosing(rings / len(first)):
-        told, _ = first.coverage(every, scenes("choice"), informs, FIRST_SHARE)
+    every, share = np.arange(len(first)), rings / len(first)
+    with phase("what returns tell"):
+        told, _ = first.coverage(every, scenes("choice"), informs, share, FIRST_SHARE)
         if not len(told.item):
-            raise InfeasibleError(f"none of {len(first)} rings tells anything about the training scenes", where=name)
+            raise InfeasibleError(f"none of {len(first)} rings has information about the training scenes", where=name)
         gains = told.gains(np.zeros(len(told.weight)))[:, 0].reshape(-1, elevations).sum(axis=0)
         candidates = replace(first, elevation_rad=refine_elevations(even, gains))
-        coverage, unit = candidates.coverage(every, scenes("choice"), informs)
+        coverage, unit = candidates.coverage(every, scenes("choice"), informs, share)
     with phase("choice"):
         choice, loss, bound = chosen_rings(coverage, candidates.place, count, channels)
     chosen = choice.rays
-    with phase("what returns tell"), information.choosing(1.0):
-        judged, _ = candidates.coverage(chosen, scenes("held back"), informs)
+    with phase("what returns tell"):
+        judged, _ = candidates.coverage(chosen, scenes("held back"), informs, 1.0)
     places, sensor = np.unique(candidates.place[chosen], return_inverse=True)
     table = candidates.rays(chosen, sensor)
     certificate = certificate_document(

@@ -29,17 +29,16 @@ from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.pattern import Pattern
 from lidardesign.sensors.sensor import (
+    CENTRING_ROUNDS,
     DEFAULT_LEVEL,
     Sensor,
     boresight_frame,
+    centred_boresight,
     interval_factor,
     tangent_coordinates,
-    tangent_directions,
 )
 from lidardesign.space import DIMENSIONS, FARTHEST_M, FULL_TURN, DesignSpace, angles, direction
 
-# Rounds in which a boresight moves to the middle of its field: away from the poles it rests after two or three.
-CENTRING_ROUNDS = 8
 # Rays of a whole turn cancel: a shorter mean of unit vectors does not define a boresight.
 SHORTEST_MEAN = 1e-3
 # Upper limit of sensors; each takes a row in every table.
@@ -223,14 +222,14 @@ def aim_of(directions: np.ndarray) -> Aim:
     mean = directions.mean(axis=0)
     if np.linalg.norm(mean) < SHORTEST_MEAN:
         mean = np.array([1.0, 0.0, 0.0])
+    azimuth, elevation = (float(angle) for angle in angles(mean))
     tried = []
     for _ in range(CENTRING_ROUNDS):
-        azimuth, elevation = (float(angle) for angle in angles(mean))
         frame = boresight_frame(azimuth, elevation)
         seen = tangent_coordinates(frame, directions)
         reach = np.abs(seen).max(axis=0)
         tried.append(Aim(azimuth, elevation, 0.0, (2 * float(reach[0]), 2 * float(reach[1]))))
-        mean = tangent_directions(frame, (seen.min(axis=0) + seen.max(axis=0))[None] / 2)[0]
+        azimuth, elevation = centred_boresight(frame, seen)
     # near a pole the frame turns with the boresight, and no round need be the best
     return min(tried, key=lambda aim: aim.field_rad[0] * aim.field_rad[1])
 

@@ -30,7 +30,7 @@ from lidardesign.problem.method import API_VERSION, INFORMS
 from lidardesign.problem.problem import DesignResult, Fired, Problem, ray_design
 from lidardesign.rays.information import informs_rays
 from lidardesign.rays.proposals import CANDIDATES_PER_RAY
-from lidardesign.rays.training_scenes import CHOICE, InformedScene, TrainingScenes
+from lidardesign.rays.training_scenes import CHOICE, SceneInformation, TrainingScenes
 from lidardesign.run.clock import phase
 from lidardesign.scenes.rays import Rays, fire_times
 from lidardesign.scoring.fired import Positions
@@ -218,7 +218,7 @@ class GreedyChoice:
         return _Table(selection, selection.coverage(informed, gates_m), gates_m)
 
     @phase("gates")
-    def _gates(self, rays: Rays, visits: Sequence[slice], informed: Sequence[InformedScene]) -> np.ndarray:
+    def _gates(self, rays: Rays, visits: Sequence[slice], informed: Sequence[SceneInformation]) -> np.ndarray:
         """The gates of candidates to choose from, (N, G, 2) [m]; the last has one bin, for any design's bandwidth."""
         from lidardesign.rays.gates import gate_choices
 

@@ -22,9 +22,9 @@ import numpy as np
 from lidardesign.numerics import SLACK, TINY
 from lidardesign.rays.choice import Choice, choose, choose_within
 from lidardesign.rays.coverage import Coverage
-from lidardesign.rays.information import checked_information, choosing
+from lidardesign.rays.information import checked_information
 from lidardesign.rays.selection import Selection
-from lidardesign.rays.training_scenes import CHOICE, InformedScene, TrainingScenes
+from lidardesign.rays.training_scenes import CHOICE, SceneInformation, TrainingScenes
 from lidardesign.run.clock import phase
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Scene
@@ -53,7 +53,7 @@ class Frames:
         features: By the task, of the frame before, (U, F), not a number where they say nothing; None without.
     """
 
-    informed: Sequence[InformedScene]
+    informed: Sequence[SceneInformation]
     range_m: np.ndarray
     features: np.ndarray | None
 
@@ -65,7 +65,7 @@ class Frames:
         return np.array([_value(one, gate_m) for one in self.informed])
 
 
-def _value(informed: InformedScene, gate_m: np.ndarray) -> float:
+def _value(informed: SceneInformation, gate_m: np.ndarray) -> float:
     rays, known = informed.ray, np.zeros(len(informed.weight))
     through = (gate_m[rays, 0] <= informed.range_m) & (informed.range_m < gate_m[rays, 1])
     if len(informed.sums):
@@ -90,11 +90,10 @@ def frames_of_scene(
     number: int,
 ) -> Frames:
     """The frames of a scene; the first has no frame before, whose features then are not a number."""
-    with choosing(share):
-        returns = simulate_many(scene, [rays])[0]
-        information = checked_information(task, scene, returns)
+    returns = simulate_many(scene, [rays])[0]
+    information = checked_information(task, scene, returns, share)
     informed = [
-        InformedScene.of(_of_frame(information, frame), [one]).with_fewer_items(
+        SceneInformation.of(_of_frame(information, frame), [one]).with_fewer_items(
             most_items, random_generator(seed, "items of frames", number, frame)
         )
         for frame, one in enumerate(returns)

@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from lidardesign.rays import kernels
-from lidardesign.rays.training_scenes import LARGEST, InformedScene
+from lidardesign.rays.training_scenes import LARGEST, SceneInformation
 
 # Where a sensor may fail: how much the mean over losses counts, and of how many sensors an item's loss is asked.
 # The mean over losses alone lets two sensors see the same: faces are 11 % worse while both live, and lose no less.
@@ -180,7 +180,7 @@ class Coverage:
         return float(self.bits[rays, gate[rays]].sum()), float(self.harm[rays, gate[rays]].sum())
 
 
-def gather(informed: Iterable[InformedScene], gates_m: np.ndarray, bits: np.ndarray) -> Coverage:
+def gather(informed: Iterable[SceneInformation], gates_m: np.ndarray, bits: np.ndarray) -> Coverage:
     """The table over scenes of equal weight, with items renumbered.
 
     Arguments:
@@ -239,7 +239,7 @@ def _passes(range_m: np.ndarray, ray: np.ndarray, gates_m: np.ndarray) -> np.nda
     return passed
 
 
-def _largest_alone(scene: InformedScene, passes: np.ndarray, gates: int) -> np.ndarray:
+def _largest_alone(scene: SceneInformation, passes: np.ndarray, gates: int) -> np.ndarray:
     """The gates (E,) less those for which another frame has more worth of the same ray about the same item."""
     pair = scene.ray.astype(np.int64) * len(scene.weight) + scene.item
     order = np.lexsort((-scene.worth, pair))

@@ -14,7 +14,7 @@ import numpy as np
 from lidardesign.constraints.document import SensorRules
 from lidardesign.mixture.bounds import Bounds, bounds_of
 from lidardesign.mixture.m_step import fit_gate
-from lidardesign.rays.training_scenes import InformedScene
+from lidardesign.rays.training_scenes import SceneInformation
 from lidardesign.run.clock import phase
 from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.sensor import Sensor, interval_factor
@@ -33,7 +33,7 @@ THINNEST_GATE_M = 1.5e-5
 def admitted_choices(
     rays: Rays,
     visits: Sequence[slice],
-    informed: Sequence[InformedScene],
+    informed: Sequence[SceneInformation],
     *,
     sensors: Sequence[Sensor],
     rules: Sequence[SensorRules],
@@ -65,7 +65,9 @@ def admitted_choices(
     return gates_m
 
 
-def gate_choices(rays: Rays, visits: Sequence[slice], informed: Sequence[InformedScene], margin_m: float) -> np.ndarray:
+def gate_choices(
+    rays: Rays, visits: Sequence[slice], informed: Sequence[SceneInformation], margin_m: float
+) -> np.ndarray:
     """A few gates for each ray, inside its own, (N, G, 2) [m]; a ray without information has its own alone.
 
     Arguments:
@@ -99,7 +101,9 @@ def gate_choices(rays: Rays, visits: Sequence[slice], informed: Sequence[Informe
     return _inside(rays, np.concatenate(ends, axis=1), LEVELS, margin_m)
 
 
-def sensor_gates(rays: Rays, visits: Sequence[slice], informed: Sequence[InformedScene], margin_m: float) -> np.ndarray:
+def sensor_gates(
+    rays: Rays, visits: Sequence[slice], informed: Sequence[SceneInformation], margin_m: float
+) -> np.ndarray:
     """A few gates of each ray's sensor, each narrower than the one before, (N, G, 2) [m]; as `gate_choices`."""
     ray, range_m = _informative_returns(informed)
     sensor, sensors = rays.sensor[ray], int(rays.sensor.max()) + 1
@@ -116,7 +120,7 @@ def _inside(rays: Rays, ends_m: np.ndarray, levels: Sequence[float], margin_m: f
     return np.where(np.isnan(ends_m), own, np.clip(ends_m + wider, own[..., :1], own[..., 1:]))
 
 
-def _informative_returns(informed: Sequence[InformedScene]) -> tuple[np.ndarray, np.ndarray]:
+def _informative_returns(informed: Sequence[SceneInformation]) -> tuple[np.ndarray, np.ndarray]:
     """All informative returns: their rays (K,) and ranges (K,) [m]."""
     returns = [scene.informative_returns for scene in informed]
     return tuple(np.concatenate(column) for column in zip(*returns, strict=True))

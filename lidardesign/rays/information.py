@@ -6,10 +6,9 @@ worth are those whose returns are nearest to the points of the surface, as in fa
 
 from __future__ import annotations
 
+import inspect
 import math
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
@@ -35,33 +34,25 @@ CHOSEN_SHARE = 0.2
 REACH_SPACINGS = math.sqrt(5.0)
 
 
-_chosen_share = ContextVar("chosen share", default=CHOSEN_SHARE)
-
-
-@contextmanager
-def choosing(share: float) -> Iterator[None]:
-    """A context in which information is for choices of another share of the candidates."""
-    token = _chosen_share.set(share)
-    try:
-        yield
-    finally:
-        _chosen_share.reset(token)
-
-
 def informs_rays(task: Task) -> bool:
     """True where a task has a method `informs`, so that its rays can be chosen."""
     return callable(getattr(task, "informs", None))
 
 
-def checked_information(task: Task, scene: Scene, returns: Sequence[Returns]) -> Information:
+def checked_information(
+    task: Task, scene: Scene, returns: Sequence[Returns], share: float = CHOSEN_SHARE
+) -> Information:
     """The information of the returns of all candidate rays about a scene, by the task, checked.
+
+    A task whose `informs` takes a keyword `share` gets the share of the candidates that will be chosen, roughly.
 
     Raises:
         PluginError: The task's code raised, or returned something else or invalid values.
     """
     where = f"task {task.name}, informs, scene {scene.name}"
     with plugin_method(task.name, "informs", where):
-        answer = task.informs(scene, returns)
+        takes_share = "share" in inspect.signature(task.informs).parameters
+        answer = task.informs(scene, returns, **({"share": share} if takes_share else {}))
     if not isinstance(answer, Information):
         allowed = "lidardesign.task.Information"
         raise PluginError(f"informs returned {type(answer).__name__}", where=where, allowed=allowed)
@@ -138,6 +129,7 @@ def surface_information(
     *,
     weight: Sequence[np.ndarray] | None = None,
     dimensions: int = 2,
+    share: float = CHOSEN_SHARE,
 ) -> Information:
     """Information of returns about a surface: max(0, D - distance) of each of its points, D the reach of a return.
 
@@ -153,12 +145,13 @@ def surface_information(
         size: The area of the surface [m^2], the length of a curve [m]; over all of the returns.
         weight: Weights of the points, (U,) each; None: all alike.
         dimensions: 2 for a surface, 1 for a curve.
+        share: The share of the candidates that will be chosen, as `informs` gets it.
     """
     from scipy.spatial import cKDTree
 
     targets = np.append(np.asarray(is_target, dtype=bool), False)  # a body of -1 is none
     hits = [one.returned & targets[one.body] for one in returns]
-    reach_m = return_reach_m(size, sum(int(hit.sum()) for hit in hits), dimensions)
+    reach_m = return_reach_m(size, sum(int(hit.sum()) for hit in hits), dimensions, share)
     count = sum(int(one.returned.sum()) for one in returns)
     rays, items, worths, frames, known = [], [], [], [], 0
     harm = np.zeros((len(returns), len(returns[0].rays)))
@@ -187,15 +180,16 @@ def surface_information(
     )
 
 
-def return_reach_m(size: float, count: int, dimensions: int = 2) -> float:
+def return_reach_m(size: float, count: int, dimensions: int = 2, share: float = CHOSEN_SHARE) -> float:
     """The reach D of a return: `REACH_SPACINGS` times the mean spacing of a choice's returns [m]; 0 without returns.
 
     Arguments:
         size: The area of the surface [m^2], the length of a curve [m].
-        count: Number of candidates' returns on it, of which the share `CHOSEN_SHARE`, or that of `choosing`, is chosen.
+        count: Number of candidates' returns on it.
         dimensions: 2 for a surface, 1 for a curve.
+        share: The share of them that is chosen.
     """
-    return REACH_SPACINGS * (size / (_chosen_share.get() * count)) ** (1 / dimensions) if count else 0.0
+    return REACH_SPACINGS * (size / (share * count)) ** (1 / dimensions) if count else 0.0
 
 
 def scattered_area_m2(points_m: np.ndarray) -> float:

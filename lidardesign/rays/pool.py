@@ -28,7 +28,7 @@ from lidardesign.rays.gates import gate_choices
 from lidardesign.rays.information import CHOSEN_SHARE, MOST_SELECTED
 from lidardesign.rays.proposals import CANDIDATES_PER_RAY, draw_order, nearest_samples
 from lidardesign.rays.selection import Selection, inform_enough
-from lidardesign.rays.training_scenes import InformedScene, TrainingScenes
+from lidardesign.rays.training_scenes import SceneInformation, TrainingScenes
 from lidardesign.run.arrays import read_npz
 from lidardesign.run.clock import phase
 from lidardesign.run.files import write_atomic
@@ -60,8 +60,8 @@ class CandidatePool:
 
     points: np.ndarray
     visits: Sequence[slice]
-    informed: Sequence[InformedScene]
-    held_back: Sequence[InformedScene]
+    informed: Sequence[SceneInformation]
+    held_back: Sequence[SceneInformation]
 
 
 @phase("pool")
@@ -99,7 +99,7 @@ def pool_of(
 
 def cached_information(
     selection: Selection, training: TrainingScenes, count: int, progress: Callable[[str], None]
-) -> tuple[list[InformedScene], list[InformedScene]]:
+) -> tuple[list[SceneInformation], list[SceneInformation]]:
     """As `inform_enough`: from the run's cache, else computed and cached where it can be written."""
     run = training.run
     path, key = run.folder / FILE_NAME, _key(selection, training, count)
@@ -143,7 +143,9 @@ def _key(selection: Selection, training: TrainingScenes, count: int) -> str:
     return hashlib.sha256(json.dumps(made_of, sort_keys=True, default=str).encode()).hexdigest()
 
 
-def _packed(informed: Sequence[InformedScene], held_back: Sequence[InformedScene], rays: int) -> dict[str, np.ndarray]:
+def _packed(
+    informed: Sequence[SceneInformation], held_back: Sequence[SceneInformation], rays: int
+) -> dict[str, np.ndarray]:
     """The arrays of all scenes one after the other, and where each begins."""
     scenes = [*informed, *held_back]
     small = np.uint16 if rays <= np.iinfo(np.uint16).max else np.int32
@@ -174,7 +176,7 @@ def _packed(informed: Sequence[InformedScene], held_back: Sequence[InformedScene
     }
 
 
-def _unpacked(arrays: Mapping[str, np.ndarray]) -> tuple[list[InformedScene], list[InformedScene]]:
+def _unpacked(arrays: Mapping[str, np.ndarray]) -> tuple[list[SceneInformation], list[SceneInformation]]:
     scenes, starts = [], arrays["starts"]
     shared = {
         "sums": arrays["sums"],
@@ -184,7 +186,7 @@ def _unpacked(arrays: Mapping[str, np.ndarray]) -> tuple[list[InformedScene], li
     for number, complete in enumerate(arrays["complete"].tolist()):
         entries, items, spoils = (slice(*starts[number : number + 2, kind]) for kind in range(3))
         scenes.append(
-            InformedScene(
+            SceneInformation(
                 ray=arrays["ray"][entries].astype(np.int32),
                 item=arrays["item"][entries].astype(np.int32),
                 worth=arrays["worth"][entries],

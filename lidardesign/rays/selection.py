@@ -18,7 +18,7 @@ from lidardesign.rays.certificate import certificate_document, certify, price_cu
 from lidardesign.rays.choice import MOST_PASSES, Choice, RayCounts, choose, choose_within
 from lidardesign.rays.coverage import Coverage, gather
 from lidardesign.rays.information import CHOSEN_SHARE, FEW_SCENES, MOST_ENTRIES, MOST_SCENES
-from lidardesign.rays.training_scenes import CHOICE, HELD_BACK, InformedScene, TrainingScenes, are_enough
+from lidardesign.rays.training_scenes import CHOICE, HELD_BACK, SceneInformation, TrainingScenes, are_enough
 from lidardesign.run.clock import phase
 from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.bandwidth import Bandwidth, split_budget
@@ -47,7 +47,7 @@ class Selection:
 
     rays: Rays
     visits: Sequence[slice]
-    gates: Callable[[Rays, Sequence[slice], Sequence[InformedScene]], np.ndarray]
+    gates: Callable[[Rays, Sequence[slice], Sequence[SceneInformation]], np.ndarray]
     bandwidth: Bandwidth
     limit_mbps: float = np.inf
     shares: np.ndarray | None = None
@@ -66,7 +66,7 @@ class Selection:
         most = np.tile(split_budget(self.shares, count, each=self.each_fires), len(self.visits))
         return RayCounts(place * len(self.shares) + self.rays.sensor[visit], most)
 
-    def coverage(self, informed: Sequence[InformedScene], gates_m: np.ndarray) -> Coverage:
+    def coverage(self, informed: Sequence[SceneInformation], gates_m: np.ndarray) -> Coverage:
         """Information of the candidates about scenes, with the bandwidth of their gates."""
         one_bin = self.bandwidth.mbps_of_widths(np.zeros(1))
         whole = gather(informed, gates_m, one_bin * self.bandwidth.bins(gates_m[..., 1] - gates_m[..., 0]))
@@ -80,7 +80,7 @@ class Selection:
         """
         if not len(coverage.item):
             raise InfeasibleError(
-                f"none of {len(self.rays)} candidate rays tells anything about {scenes} training scenes",
+                f"none of {len(self.rays)} candidate rays has information about {scenes} training scenes",
                 where=self.name,
                 hint="let sensors look at the targets: from another place, constrained less, or learn longer",
             )
@@ -209,8 +209,8 @@ class Selected:
 
 def select(
     selection: Selection,
-    informed: Sequence[InformedScene],
-    held_back: Sequence[InformedScene],
+    informed: Sequence[SceneInformation],
+    held_back: Sequence[SceneInformation],
     counts: Sequence[int],
     certified: Sequence[int] = (),
     progress: Callable[[str], None] = lambda step: None,
@@ -270,7 +270,7 @@ def select(
     return selected
 
 
-def silent_share(scenes: Sequence[InformedScene], gate_m: np.ndarray) -> float:
+def silent_share(scenes: Sequence[SceneInformation], gate_m: np.ndarray) -> float:
     """The share of scenes without an informative return inside its ray's gate, 0 without scenes.
 
     Arguments:
@@ -283,7 +283,7 @@ def silent_share(scenes: Sequence[InformedScene], gate_m: np.ndarray) -> float:
 
 def inform_enough(
     selection: Selection, training: TrainingScenes, count: int, progress: Callable[[str], None]
-) -> tuple[list[InformedScene], list[InformedScene]]:
+) -> tuple[list[SceneInformation], list[SceneInformation]]:
     """Information of candidates about as many scenes as a choice of `count` rays needs, and about scenes held back.
 
     Arguments:
@@ -303,7 +303,7 @@ def inform_enough(
     open_gates = rays.gate_m[:, None]
     held_back = training.inform(HELD_BACK, rays, visits, 0, FEW_SCENES, selection.share)
     judged = selection.coverage(held_back, open_gates)
-    informed: list[InformedScene] = []
+    informed: list[SceneInformation] = []
     wanted, loss = 2 * FEW_SCENES, np.inf
     while True:
         progress(f"finding out what {len(rays)} rays tell about {wanted} training scenes")

@@ -11,13 +11,7 @@ from typing import TypeVar
 import numpy as np
 
 from lidardesign.numerics import systematic_draw
-from lidardesign.rays.information import (
-    CHOSEN_SHARE,
-    FEW_SCENES,
-    MOST_ITEMS,
-    checked_information,
-    choosing,
-)
+from lidardesign.rays.information import CHOSEN_SHARE, FEW_SCENES, MOST_ITEMS, checked_information
 from lidardesign.run.clock import phase
 from lidardesign.run_folder import RunFolder
 from lidardesign.scenes.rays import Outcome, Rays, Returns
@@ -29,7 +23,8 @@ from lidardesign.workers import Starmap
 MARGIN_SIGMAS = 2.0  # by which gates are longer than what training scenes returned, in the density's sigma
 # Chosen on, and held back from the choice.
 CHOICE, HELD_BACK = "choice", "held back"
-Informs = Callable[[Scene, Sequence[Returns]], Information]
+# A task's information of the returns of candidates in a scene, by the share of them that will be chosen.
+Informs = Callable[[Scene, Sequence[Returns], float], Information]
 Found = TypeVar("Found")
 # Scenes are enough once doubling them lowered the loss on scenes held back by less than the first share, and the loss
 # on its own scenes is lower by at most the second; doubling again would gain about a hundredth.
@@ -83,7 +78,7 @@ class TrainingScenes:
     @phase("what returns tell")
     def inform(
         self, purpose: str, rays: Rays, visits: Sequence[slice], start: int, stop: int, share: float = CHOSEN_SHARE
-    ) -> list[InformedScene]:
+    ) -> list[SceneInformation]:
         """Information of rays about the scenes `start` to before `stop`.
 
         Arguments:
@@ -95,7 +90,7 @@ class TrainingScenes:
         """
         kept = self._first.get(purpose, [])
         scenes = itertools.chain(kept[start:], self.scenes(purpose, max(start, len(kept))))
-        work = partial(informed_scene, self.run.task, rays, visits, share, self.seed, purpose)
+        work = partial(sampled_information, self.run.task, rays, visits, share, self.seed, purpose)
         return self.over(work, itertools.islice(scenes, stop - start), start)
 
     def over(self, work: Callable[[Scene, int], Found], scenes: Iterable[Scene], start: int = 0) -> list[Found]:
@@ -103,16 +98,17 @@ class TrainingScenes:
         return list(self._starmap(work, ((scene, number) for number, scene in enumerate(scenes, start))))
 
 
-def informed_scene(
+def sampled_information(
     task: Task, rays: Rays, visits: Sequence[slice], share: float, seed: int, purpose: str, scene: Scene, number: int
-) -> InformedScene:
+) -> SceneInformation:
     """Information of rays about a random draw of one scene's items."""
-    with choosing(share):
-        found = inform(scene, rays, visits, partial(checked_information, task))
+    found = information_of(scene, rays, visits, partial(checked_information, task), share)
     return found.with_fewer_items(MOST_ITEMS, random_generator(seed, "items", purpose, number))
 
 
-def inform(scene: Scene, rays: Rays, visits: Sequence[slice], informs: Informs) -> InformedScene:
+def information_of(
+    scene: Scene, rays: Rays, visits: Sequence[slice], informs: Informs, share: float
+) -> SceneInformation:
     """A task's information of the returns of rays in a scene, through the rays' own gates.
 
     Arguments:
@@ -120,10 +116,11 @@ def inform(scene: Scene, rays: Rays, visits: Sequence[slice], informs: Informs) 
         rays: All candidates.
         visits: Slices of the rays at each condition; at the other conditions they have no returns.
         informs: The task's information of a scene's returns.
+        share: The share of the candidates that will be chosen.
     """
     fired = simulate_many(scene, [rays.subset(visit) for visit in visits])
     returns = [pad_returns(rays, visit, frame) for visit, frames in zip(visits, fired, strict=True) for frame in frames]
-    return InformedScene.of(informs(scene, returns), returns)
+    return SceneInformation.of(informs(scene, returns, share), returns)
 
 
 def pad_returns(rays: Rays, fired: slice, returns: Returns) -> Returns:
@@ -134,7 +131,7 @@ def pad_returns(rays: Rays, fired: slice, returns: Returns) -> Returns:
 
 
 @dataclass(frozen=True, eq=False)
-class InformedScene:
+class SceneInformation:
     """A task's information of a scene's returns, with their ranges, from which gates follow.
 
     Arguments:
@@ -164,7 +161,7 @@ class InformedScene:
     unit: str
 
     @classmethod
-    def of(cls, information: Information, returns: Sequence[Returns]) -> InformedScene:
+    def of(cls, information: Information, returns: Sequence[Returns]) -> SceneInformation:
         """The checked information of the returns of all candidate rays, through open gates."""
         range_m = np.stack([frame.range_m for frame in returns])
         tells = np.flatnonzero(information.worth > 0)
@@ -198,7 +195,7 @@ class InformedScene:
         is_first = np.append(True, (np.diff(ray) > 0) | (np.diff(range_m) > 0))[: len(ray)]
         return ray[is_first].astype(np.intp), range_m[is_first]
 
-    def of_rays(self, number: np.ndarray) -> InformedScene:
+    def of_rays(self, number: np.ndarray) -> SceneInformation:
         """The information of some rays under new numbers (N,), -1 for rays that are left out."""
         kept, spoils = number[self.ray] >= 0, number[self.spoiling] >= 0
         return replace(
@@ -212,7 +209,7 @@ class InformedScene:
             harm_range_m=self.harm_range_m[spoils],
         )
 
-    def with_fewer_items(self, most: int, generator: np.random.Generator) -> InformedScene:
+    def with_fewer_items(self, most: int, generator: np.random.Generator) -> SceneInformation:
         """The information about a random draw of at most `most` items by weight; about all where there are no more."""
         if len(self.weight) <= most:
             return self

@@ -14,9 +14,10 @@ import numpy as np
 from scipy.special import ndtri
 
 from lidardesign.numerics import FULL_TURN, effective_count, wrap_turn
-from lidardesign.report.scene_figure import body_triangles, drawn_share
+from lidardesign.report.scene_figure import drawn_share
 from lidardesign.samples import Samples
 from lidardesign.scenes.scene import Plane, Scene
+from lidardesign.scenes.triangulation import body_triangles
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.pattern import low_discrepancy
 from lidardesign.sensors.sensor import Sensor, interval_factor, tangent_directions

@@ -179,7 +179,7 @@ def _sections(report: Report) -> list[tuple[str, str, str]]:
         ("sensors", "Sensors", sensors_section(designs)),
         ("scene", "Designs in a scene", view_section(report.shown, shown, report.density_m)),
         ("scores", "Scores", scores_section(evaluation)),
-        ("mounting", "Mounted carelessly", mounting_section(evaluation)),
+        ("mounting", "Mounting errors", mounting_section(evaluation)),
         ("density", "The learned density", density_section(report.density, looks) if report.density else ""),
         ("choice", "Chosen rays and how far from the best", choice_section(designs, evaluation, looks)),
         ("constraints", "Constraints and how tight each is", constraints_section(report.constraints)),

@@ -25,14 +25,13 @@ from lidardesign.report.scene_figure import (
     drawn_share,
     gate_shell,
     origin_lines,
-    own_triangles,
     round_steps,
-    scene_bounds,
 )
 from lidardesign.run.markup import rendered
 from lidardesign.scenes.rays import Outcome
 from lidardesign.scenes.scene import Body, Mesh, Scene
 from lidardesign.scenes.surface import half_extents_m
+from lidardesign.scenes.triangulation import own_triangles, scene_bounds
 from lidardesign.sensors.pattern import field_on_sphere
 from lidardesign.sensors.sensor import Sensor, interval_factor
 

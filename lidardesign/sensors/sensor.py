@@ -22,6 +22,8 @@ from lidardesign.numerics import sphere_exp, sphere_log
 from lidardesign.space import angles, direction
 
 DEFAULT_LEVEL = 0.95
+# Rounds in which a boresight moves to the middle of its field: away from the poles it rests after two or three.
+CENTRING_ROUNDS = 8
 
 
 def interval_factor(level: float) -> float:
@@ -61,6 +63,13 @@ def tangent_coordinates(frame: np.ndarray, directions: np.ndarray) -> np.ndarray
 def tangent_directions(frame: np.ndarray, tangent: np.ndarray) -> np.ndarray:
     """Unit vectors at angles (horizontal, vertical) from a boresight: (3, 3), (N, 2) to (N, 3)."""
     return sphere_exp(tangent) @ frame
+
+
+def centred_boresight(frame: np.ndarray, tangent: np.ndarray) -> tuple[float, float]:
+    """Azimuth and elevation of the middle of a field, of angles (N, 2) from the boresight of a frame [rad]."""
+    middle = (tangent.min(axis=0) + tangent.max(axis=0)) / 2
+    azimuth, elevation = angles(tangent_directions(frame, middle[None])[0])
+    return float(azimuth), float(elevation)
 
 
 @dataclass(frozen=True, eq=False)

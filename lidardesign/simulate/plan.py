@@ -406,7 +406,7 @@ class _Chance:
 
     def __init__(self, counts: Counts) -> None:
         detector, sigma_m, blind = counts.first_hits.detector, counts.first_hits.sigma_m(), Blindness.of(counts)
-        self.lost = counts.by_chance(blind, sigma_m)
+        self.lost = counts.false_return_probability(blind, sigma_m)
         if detector.estimator == "peak":
             self.squared_m2 = 2 * counts.error_m(blind.left, sigma_m) ** 2
         else:

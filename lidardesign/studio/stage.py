@@ -14,14 +14,13 @@ from lidardesign.report.scene_figure import (
     drawn_share,
     frustum_lines,
     origin_lines,
-    own_triangles,
     round_steps,
-    scene_bounds,
 )
 from lidardesign.report.view import MARGIN, OUTCOMES, camera
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import Outcome, Rays, Returns
 from lidardesign.scenes.scene import Body, Plane, Scene
+from lidardesign.scenes.triangulation import own_triangles, scene_bounds
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.sensor import DEFAULT_LEVEL, Sensor, boresight_of
 from lidardesign.space import direction

@@ -18,7 +18,7 @@ from lidardesign.api.scores import Scores
 from lidardesign.clouds.seen import Measuring, SeenScene
 from lidardesign.constraints.origins import SAME_PLACE_M, place_text
 from lidardesign.errors import BackgroundNote, ConfigError, LidardesignError
-from lidardesign.estimates import Interval, figure_and_interval, mean_interval, paired_difference
+from lidardesign.estimates import Interval, comparison, figure_and_interval, mean_interval, paired_difference
 from lidardesign.fitting.options import check_name
 from lidardesign.formats import FORMATS
 from lidardesign.parts.catalogue import load_library
@@ -38,7 +38,7 @@ from lidardesign.studio.choices import EVERY, MOUNT, Choices, SensorPose
 from lidardesign.studio.panel import BLIND, DENSITY, LAYERS, LIGHTS, NONE, SPLITS, STEPS, ControlPanel
 from lidardesign.studio.server import Worker, start_server, stop_server
 from lidardesign.studio.stage import BESIDE, Stage
-from lidardesign.task import Metric, random_generator
+from lidardesign.task import random_generator
 
 DENSITY_POINTS = 3000
 MOST_UNDONE = 100
@@ -345,11 +345,10 @@ class Studio:
             f"{_figure(mean_interval(values, **how), metric.unit)} {metric.name}, {metric.better} is better, "
             f"on {len(values)} training scenes kept for comparing"
         ]
-        lines += [
-            f"{_compared(paired_difference(values, self._training_scores(other, *world), **how), metric)} than {name}"
-            for name, other in (("before the last change", self._reference), (beside and beside.name, beside))
-            if other is not None and other is not choices.design
-        ]
+        for name, other in (("before the last change", self._reference), (beside and beside.name, beside)):
+            if other is not None and other is not choices.design:
+                difference = paired_difference(values, self._training_scores(other, *world), **how)
+                lines.append(comparison(difference, str(name), metric.better, metric.unit))
         self._page.ask("scored", partial(self._show_status, choices, lines))
 
     def _new_scorer(self, detector: str, settings: tuple[str, ...]) -> TrainingScorer:
@@ -454,21 +453,10 @@ class Studio:
             self._show_controls()
 
 
-def _figure(interval: Interval, unit: str, word: str = "") -> str:
+def _figure(interval: Interval, unit: str) -> str:
     value, low, high = figure_and_interval(interval.mean, interval.low, interval.high)
     ends = "" if interval.low is None else f" ({low} to {high})"
-    return " ".join(filter(None, (value, unit, word))) + ends
-
-
-def _compared(difference: Interval, metric: Metric) -> str:
-    """A difference of scores, as `0.3 mm better (0.1 to 0.5)`."""
-    if not difference.mean:
-        return "no better or worse"
-    word = "better" if (difference.mean < 0) == (metric.better == "lower") else "worse"
-    if difference.mean < 0:
-        ends = [None if end is None else -end for end in (difference.high, difference.low)]
-        difference = Interval(-difference.mean, *ends)
-    return _figure(difference, "points" if metric.unit == "%" else metric.unit, word)
+    return f"{value} {unit}".rstrip() + ends
 
 
 def _three_numbers(text: str) -> list[float]:

@@ -15,12 +15,23 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from lidardesign.errors import ConfigError
-from lidardesign.scenes.rays import Returns
-from lidardesign.scenes.scene import Body, Scene, Sphere, rigid
-from lidardesign.scoring.metrics import discrete_frechet_m
-from lidardesign.space import DesignSpace
-from lidardesign.task import Defaults, Information, Interval, Metric, Score, Split, random_generator
+from lidardesign import (
+    Body,
+    ConfigError,
+    Defaults,
+    DesignSpace,
+    Information,
+    Interval,
+    Metric,
+    Returns,
+    Scene,
+    Score,
+    Sphere,
+    Split,
+    metrics,
+    random_generator,
+    rigid,
+)
 from lidardesign_tasks.robot.arm_motion import Arm, Motion
 from lidardesign_tasks.robot.arm_robot import BALL_RADIUS_M, Robot, load_robot
 from lidardesign_tasks.robot.tracking import FEWEST_FRAMES, MEAN_DEPTH, filled_path, path_information, tracked_places
@@ -111,7 +122,7 @@ class ArmTask:
         if len(frames) < FEWEST_FRAMES:
             return Score(self.metric.worst, failed=True, details=details)
         path = filled_path(frames, places, scene.frames)
-        return Score(min(discrete_frechet_m(path, scene.truth["ball_m"]), self.metric.worst), details=details)
+        return Score(min(metrics.discrete_frechet_m(path, scene.truth["ball_m"]), self.metric.worst), details=details)
 
     def informs(self, scene: Scene, returns: Sequence[Returns]) -> Information:
         """Information of returns on the ball about its position in their own and in neighbouring frames."""

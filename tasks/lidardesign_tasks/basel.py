@@ -13,8 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from lidardesign.errors import DataError
-from lidardesign.run.inputs import HEAD_MODEL, check_bytes, check_file
+from lidardesign import DataError, inputs
 
 Unit = Literal["auto", "mm", "cm", "m"]
 METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
@@ -63,7 +62,7 @@ def load_model(path: str | Path, *, unit: Unit = "auto", modes: int | None = Non
     import h5py
 
     path = Path(path)
-    check_file(path, HEAD_MODEL, hint=f"give a morphable model in {LAYOUT}")
+    inputs.check_file(path, inputs.HEAD_MODEL, hint=f"give a morphable model in {LAYOUT}")
     try:
         with h5py.File(path, "r") as file:
             return _read(_File(file, str(path)), unit, modes)
@@ -97,7 +96,9 @@ class _File:
         if dataset.file != self.file or dataset.external or dataset.is_virtual:
             raise self.fail(present[0], "is stored in another file", "all data in one file")
         self.unpacked += dataset.size * np.dtype(np.float64).itemsize
-        check_bytes(self.unpacked, HEAD_MODEL, f"{self.where}: dataset {self.prefix}{present[0]}", unpacked=True)
+        inputs.check_bytes(
+            self.unpacked, inputs.HEAD_MODEL, f"{self.where}: dataset {self.prefix}{present[0]}", unpacked=True
+        )
         try:
             values = np.asarray(dataset[()])
         except OSError as error:

@@ -15,11 +15,23 @@ from typing import Annotated, ClassVar
 import numpy as np
 from pydantic import Field, field_validator
 
-from lidardesign.errors import ConfigError
-from lidardesign.scenes.rays import Returns
-from lidardesign.scenes.scene import Mesh, Receiver, Scene, inverse_rigid
-from lidardesign.space import DesignSpace
-from lidardesign.task import Defaults, Information, Interval, Metres, Metric, Score, Split, Vector
+from lidardesign import (
+    ConfigError,
+    Defaults,
+    DesignSpace,
+    Information,
+    Interval,
+    Mesh,
+    Metres,
+    Metric,
+    Receiver,
+    Returns,
+    Scene,
+    Score,
+    Split,
+    Vector,
+    inverse_rigid,
+)
 from lidardesign_tasks.face import FaceTask, HeadConfig, head_scenes
 from lidardesign_tasks.importance import WEIGHING_KEYS
 from lidardesign_tasks.surface import surface_informs, surface_score
@@ -120,9 +132,9 @@ class EmitterTask:
         """Chamfer distance between the reconstruction and the visible part of the face [mm]."""
         return surface_score(self.metric, scene, returns)
 
-    def informs(self, scene: Scene, returns: Sequence[Returns]) -> Information:
+    def informs(self, scene: Scene, returns: Sequence[Returns], share: float) -> Information:
         """Information of returns about points of the visible face, larger for nearer points."""
-        return surface_informs(scene, returns)
+        return surface_informs(scene, returns, share)
 
 
 def winding_number(mesh: Mesh, point: np.ndarray) -> float:

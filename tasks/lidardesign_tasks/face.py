@@ -17,12 +17,24 @@ from typing import ClassVar
 import numpy as np
 from pydantic import Field
 
-from lidardesign.errors import ConfigError
-from lidardesign.scenes.mesh_files import check_mesh, usable_faces
-from lidardesign.scenes.rays import Returns
-from lidardesign.scenes.scene import Body, Mesh, Receiver, Scene, Sign
-from lidardesign.space import DesignSpace
-from lidardesign.task import Defaults, Information, Interval, Metric, Score, Split, random_generator
+from lidardesign import (
+    Body,
+    ConfigError,
+    Defaults,
+    DesignSpace,
+    Information,
+    Interval,
+    Mesh,
+    Metric,
+    Receiver,
+    Returns,
+    Scene,
+    Score,
+    Sign,
+    Split,
+    mesh_files,
+    random_generator,
+)
 from lidardesign_tasks.basel import MorphableModel, Unit, load_model
 from lidardesign_tasks.importance import WEIGHING_KEYS, Importance, middle_of_origins
 from lidardesign_tasks.poses import jittered_pose
@@ -90,9 +102,9 @@ class FaceTask:
         """Chamfer distance between the reconstruction and the visible part of the face [mm]."""
         return surface_score(self.metric, scene, returns)
 
-    def informs(self, scene: Scene, returns: Sequence[Returns]) -> Information:
+    def informs(self, scene: Scene, returns: Sequence[Returns], share: float) -> Information:
         """Information of returns about points of the visible face, larger for nearer points."""
-        return surface_informs(scene, returns)
+        return surface_informs(scene, returns, share)
 
 
 def head_scenes(
@@ -132,8 +144,8 @@ class HeadFamily:
     def __init__(self, model: MorphableModel, sign: Sign, where: str) -> None:
         self.model = model
         notes = list(model.notes)
-        self.faces = usable_faces(model.mean, model.faces, notes)
-        checked = check_mesh(model.mean, self.faces, sign=sign, where=where)
+        self.faces = mesh_files.usable_faces(model.mean, model.faces, notes)
+        checked = mesh_files.check_mesh(model.mean, self.faces, sign=sign, where=where)
         self.sign, self.notes = checked.sign, (*notes, *checked.notes)
         mean = model.mean[:, WORLD_AXES]
         self.nose_tip = mean[mean[:, 0].argmax()]

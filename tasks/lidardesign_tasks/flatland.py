@@ -15,13 +15,25 @@ from typing import ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from lidardesign.rays.information import surface_information
-from lidardesign.scenes.casting import SceneCaster
-from lidardesign.scenes.rays import Returns
-from lidardesign.scenes.scene import Body, Capsule, Scene, Sphere, rigid
-from lidardesign.scoring.metrics import chamfer_m
-from lidardesign.space import DesignSpace, aim
-from lidardesign.task import Defaults, Information, Metric, Score, Split, random_generator
+from lidardesign import (
+    Body,
+    Capsule,
+    Defaults,
+    DesignSpace,
+    Information,
+    Metric,
+    Returns,
+    Scene,
+    SceneCaster,
+    Score,
+    Sphere,
+    Split,
+    aim,
+    metrics,
+    random_generator,
+    rigid,
+    surface_information,
+)
 from lidardesign_tasks.surroundings import Surroundings
 
 MILLIMETRES = 1000.0
@@ -80,16 +92,17 @@ class FlatlandTask:
         curve = reconstruct_curve(points)
         if curve is None:
             return Score(self.metric.worst, failed=True, details={"returns": float(len(points))})
-        value = MILLIMETRES * chamfer_m(curve, scene.truth["curve_m"])
+        value = MILLIMETRES * metrics.chamfer_m(curve, scene.truth["curve_m"])
         return Score(min(value, self.metric.worst), details={"returns": float(len(points))})
 
-    def informs(self, scene: Scene, returns: Sequence[Returns]) -> Information:
+    def informs(self, scene: Scene, returns: Sequence[Returns], share: float) -> Information:
         """Information of returns about points of the visible curve, larger for nearer points."""
         curve = in_space(scene.truth["curve_m"])
         points = curve[np.linspace(0, len(curve) - 1, min(ITEMS, len(curve))).astype(int)]
         is_target = [body.is_target for body in scene.bodies]
         length_m = TRUTH_STEP_M * len(curve) * len(returns)
-        return surface_information([points] * len(returns), returns, is_target, length_m, dimensions=1)
+        points_m = [points] * len(returns)
+        return surface_information(points_m, returns, is_target, length_m, dimensions=1, share=share)
 
 
 def measured_points(returns: Sequence[Returns]) -> np.ndarray:

@@ -15,10 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 from pydantic import Field, model_validator
 
-from lidardesign.errors import ConfigError
-from lidardesign.scenes.surface import sample_triangles
-from lidardesign.space import DesignSpace
-from lidardesign.task import Vector, random_generator
+from lidardesign import ConfigError, DesignSpace, Vector, random_generator, sample_triangles
 from lidardesign_tasks.surroundings import Surroundings
 
 # Lower limit of roughness as a share of its mean, so that no part has the weight 0.

@@ -23,22 +23,27 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import Discriminator, Field, Tag, model_validator
 
-from lidardesign.errors import ConfigError, DataError
-from lidardesign.run.validation import suggest
-from lidardesign.scenes.mesh_files import (
-    COLOURS,
-    OTHER_FORMATS,
-    SUFFIXES,
-    TABLES,
-    Y_UP,
-    Painted,
-    list_mesh_files,
-    load_mesh,
+from lidardesign import (
+    FARTHEST_M,
+    Body,
+    ConfigError,
+    DataError,
+    Defaults,
+    DesignSpace,
+    FolderConfig,
+    Information,
+    Mesh,
+    Metric,
+    Returns,
+    Scene,
+    Score,
+    Sign,
+    Split,
+    Vector,
+    mesh_files,
+    random_generator,
+    suggest,
 )
-from lidardesign.scenes.rays import Returns
-from lidardesign.scenes.scene import Body, Mesh, Scene, Sign
-from lidardesign.space import FARTHEST_M, DesignSpace
-from lidardesign.task import Defaults, FolderConfig, Information, Metric, Score, Split, Vector, random_generator
 from lidardesign_tasks.importance import WEIGHING_KEYS, Importance, middle_of_origins
 from lidardesign_tasks.motion import Motion, load_motion, moved_bounds_m
 from lidardesign_tasks.moving_surface import SURFACES, moving_informs, moving_score, with_moving_truth
@@ -78,7 +83,7 @@ ALONE = ("motion", "speed_m_s", "jitter_rotation_deg", "jitter_translation_m", "
 class MeshesConfig(FolderConfig, Importance):
     """Folder, reading, split, motion and importance of meshes, their surroundings, and bounds of sensors."""
 
-    folders: ClassVar[dict[str, tuple[str, ...]]] = {"folder": SUFFIXES, "occluders": SUFFIXES}
+    folders: ClassVar[dict[str, tuple[str, ...]]] = {"folder": mesh_files.SUFFIXES, "occluders": mesh_files.SUFFIXES}
 
     folder: Path | None = Field(None, description="folder of mesh files (glb, gltf, obj, off, ply, stl)")
     leave_out: tuple[str, ...] = Field((), description="names of files that are not read, or patterns such as *_old.*")
@@ -145,7 +150,10 @@ class MeshesConfig(FolderConfig, Importance):
 
     @model_validator(mode="after")
     def _contrast_of_colours(self) -> MeshesConfig:
-        if self.importance != COLOURS and self.colour_contrast != type(self).model_fields["colour_contrast"].default:
+        if (
+            self.importance != mesh_files.COLOURS
+            and self.colour_contrast != type(self).model_fields["colour_contrast"].default
+        ):
             raise ValueError("colour_contrast needs importance=colours")
         return self
 
@@ -275,10 +283,10 @@ class MeshesTask:
         score = moving_score if SURFACES in scene.truth else surface_score
         return score(scene.truth.get(METRIC, self.metric), scene, _without_known(scene, returns))
 
-    def informs(self, scene: Scene, returns: Sequence[Returns]) -> Information:
+    def informs(self, scene: Scene, returns: Sequence[Returns], share: float) -> Information:
         """Information of returns about points of the visible surface in each frame, larger for nearer points."""
         informs = moving_informs if SURFACES in scene.truth else surface_informs
-        return informs(scene, _without_known(scene, returns))
+        return informs(scene, _without_known(scene, returns), share)
 
 
 def _without_known(scene: Scene, returns: Sequence[Returns]) -> Sequence[Returns]:
@@ -342,10 +350,14 @@ def _what_was_not_read(config: MeshesConfig) -> list[str]:
     others: dict[tuple[str, str | None], list[str]] = {}
     for path in entries:
         suffix = path.suffix.lower()
-        if path.is_dir() and path != config.occluders and any(one.suffix.lower() in SUFFIXES for one in path.glob("*")):
+        if (
+            path.is_dir()
+            and path != config.occluders
+            and any(one.suffix.lower() in mesh_files.SUFFIXES for one in path.glob("*"))
+        ):
             others.setdefault(("a folder of meshes inside the folder", "move them out of it"), []).append(path.name)
-        elif suffix in OTHER_FORMATS and suffix not in TABLES and path.name not in left_out:
-            others.setdefault(OTHER_FORMATS[suffix], []).append(path.name)
+        elif suffix in mesh_files.OTHER_FORMATS and suffix not in mesh_files.TABLES and path.name not in left_out:
+            others.setdefault(mesh_files.OTHER_FORMATS[suffix], []).append(path.name)
     return [
         *([f"left out: {', '.join(left_out)}"] if left_out else []),
         *(
@@ -365,7 +377,7 @@ def load_folder(config: MeshesConfig) -> list[tuple[str, Mesh]]:
     if config.folder is None:
         raise ConfigError("no folder of meshes is set", where="task.folder", hint="--set folder=PATH")
     _check_names(config)
-    painted = None if config.importance is None else Painted(config.importance, config.colour_contrast)
+    painted = None if config.importance is None else mesh_files.Painted(config.importance, config.colour_contrast)
     return _load(str(config.folder), config, config.sign, config.centre, painted)
 
 
@@ -397,7 +409,7 @@ def weighted(mesh: Mesh, config: MeshesConfig, space: DesignSpace) -> Mesh:
 
 
 def _load(
-    folder: str, config: MeshesConfig, sign: Sign, centre: bool, painted: Painted | None = None
+    folder: str, config: MeshesConfig, sign: Sign, centre: bool, painted: mesh_files.Painted | None = None
 ) -> list[tuple[str, Mesh]]:
     meshes, errors = [], {}
     for name, path in config.learned_files(_mesh_files(folder, config)).items():
@@ -430,7 +442,7 @@ def _unusable(folder: str, errors: Mapping[str, DataError], usable: int, config:
 
 def _mesh_files(folder: str | Path, config: MeshesConfig) -> list[Path]:
     """Paths of the mesh files inside a folder that are not left out, sorted by name."""
-    files = [path for path in list_mesh_files(folder) if config.reads(path)]
+    files = [path for path in mesh_files.list_mesh_files(folder) if config.reads(path)]
     if not files:
         raise ConfigError(f"leaves out every mesh of {folder}", where="task.leave_out", allowed="some of them")
     return files
@@ -450,12 +462,19 @@ def _check_names(config: MeshesConfig) -> None:
 
 @lru_cache(maxsize=256)
 def _load_file(
-    path: Path, changed_ns: int, size: int, sign: Sign, scale: float, up: Axis, centre: bool, painted: Painted | None
+    path: Path,
+    changed_ns: int,
+    size: int,
+    sign: Sign,
+    scale: float,
+    up: Axis,
+    centre: bool,
+    painted: mesh_files.Painted | None,
 ) -> Mesh:
     """Read a file, once per process while it is unchanged, as space and both splits need it."""
-    mesh = load_mesh(path, sign=sign, scale=scale, painted=painted)
+    mesh = mesh_files.load_mesh(path, sign=sign, scale=scale, painted=painted)
     if up == "format":
-        up = "y" if path.suffix.lower() in Y_UP else "z"
+        up = "y" if path.suffix.lower() in mesh_files.Y_UP else "z"
     vertices = mesh.vertices[:, WORLD_AXES[up]]
     if centre:
         vertices = vertices - (vertices.min(axis=0) + vertices.max(axis=0)) / 2

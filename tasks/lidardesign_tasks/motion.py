@@ -9,8 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidardesign.errors import ConfigError, DataError
-from lidardesign.scenes.scene import Mesh
+from lidardesign import ConfigError, DataError, Mesh
 from lidardesign_tasks.poses import BodyPath, read_poses, span_s
 
 EVERY = "*"

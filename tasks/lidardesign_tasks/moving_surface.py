@@ -12,12 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from lidardesign.errors import DataError
-from lidardesign.scenes.rays import Returns
-from lidardesign.scenes.scene import Scene
-from lidardesign.scoring.metrics import SurfaceCloud, visible_surface
-from lidardesign.space import DesignSpace
-from lidardesign.task import Information, Metric, Score, random_generator
+from lidardesign import DataError, DesignSpace, Information, Metric, Returns, Scene, Score, metrics, random_generator
 from lidardesign_tasks.surface import ITEMS, LazyTruth, fewer_points, information_of, surface_score
 
 SURFACES = "surfaces"
@@ -29,7 +24,7 @@ class MovingTruth(LazyTruth):
 
     key = SURFACES
 
-    def find(self) -> tuple[SurfaceCloud | None, ...]:
+    def find(self) -> tuple[metrics.SurfaceCloud | None, ...]:
         """Compute the visible part of the targets in each frame."""
         found = [self._surface(frame) for frame in range(self.scene.frames)]
         if all(surface is None for surface in found):
@@ -40,10 +35,10 @@ class MovingTruth(LazyTruth):
             )
         return tuple(found)
 
-    def _surface(self, frame: int) -> SurfaceCloud | None:
+    def _surface(self, frame: int) -> metrics.SurfaceCloud | None:
         generator = random_generator(self.seed, "truth", frame)
         try:
-            return visible_surface(self.scene, self.space, self.points, generator, frame=frame)
+            return metrics.visible_surface(self.scene, self.space, self.points, generator, frame=frame)
         except DataError:
             # no target is in view
             return None
@@ -71,13 +66,13 @@ def moving_score(metric: Metric, scene: Scene, returns: Sequence[Returns]) -> Sc
     return Score(value, failed=failed == len(scores), details={**details, "failed_frames": float(failed)})
 
 
-def moving_informs(scene: Scene, returns: Sequence[Returns]) -> Information:
+def moving_informs(scene: Scene, returns: Sequence[Returns], share: float) -> Information:
     """Information of returns about points of the visible surface of their own frame, see `surface_information`.
 
     A frame without a visible surface has no points, and its returns are ignored.
     """
     count = max(ITEMS // scene.frames, FEWEST_ITEMS)
-    return information_of(fewer_points(scene.truth, count)[SURFACES], scene, returns)
+    return information_of(fewer_points(scene.truth, count)[SURFACES], scene, returns, share)
 
 
 def _frames(scene: Scene, returns: Sequence[Returns]) -> list[tuple[Scene, list[Returns]]]:

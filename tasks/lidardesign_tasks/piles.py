@@ -14,10 +14,7 @@ from typing import Literal
 
 import numpy as np
 
-from lidardesign.errors import DataError
-from lidardesign.scenes.mujoco_models import import_mujoco, mujoco_warnings
-from lidardesign.scenes.rays import Outcome, Returns
-from lidardesign.scenes.scene import Body, Box, Mesh, rigid
+from lidardesign import Body, Box, DataError, Mesh, Outcome, Returns, mujoco_models, rigid
 
 Kind = Literal["bin", "table"]
 # Size of objects in the scaled simulation, their density, and its time step.
@@ -197,7 +194,7 @@ class _Simulation:
     """Simulation of objects, a background, and planes that keep objects inside until all have fallen."""
 
     def __init__(self, hulls: Sequence[np.ndarray], background: Background) -> None:
-        mujoco = import_mujoco()
+        mujoco = mujoco_models.import_mujoco()
         self.background, self.scale = background, SIMULATED_M / background.object_m
         specification = mujoco.MjSpec()
         option = specification.option
@@ -219,7 +216,7 @@ class _Simulation:
             body = world.add_body()
             body.add_freejoint()
             body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"hull{number}", density=DENSITY_KG_M3, **solid)
-        with mujoco_warnings():
+        with mujoco_models.mujoco_warnings():
             self.model = specification.compile()
         self.guides = np.flatnonzero(self.model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
         self.data = mujoco.MjData(self.model)
@@ -228,7 +225,7 @@ class _Simulation:
         """Scaled positions and quaternions (N, 7) of the objects at rest; None if some do not come to rest."""
         from scipy.spatial.transform import Rotation
 
-        mujoco, count = import_mujoco(), self.model.nbody - 1
+        mujoco, count = mujoco_models.import_mujoco(), self.model.nbody - 1
         mujoco.mj_resetData(self.model, self.data)
         free = max(self.scale * self.background.dropped_half_m - SIMULATED_M / 2, 0.0)
         order = generator.permutation(count)
@@ -241,7 +238,7 @@ class _Simulation:
             turn = Rotation.from_rotvec(generator.uniform(0, 2 * np.pi, (count, 1)) * np.array([0.0, 0.0, 1.0]))
         start[:, 3:] = turn.as_quat()[:, [3, 0, 1, 2]]
         self.data.qpos[:] = start.ravel()
-        with mujoco_warnings() as warnings:
+        with mujoco_models.mujoco_warnings() as warnings:
             for guided in (1, 0):
                 self.model.geom_contype[self.guides] = self.model.geom_conaffinity[self.guides] = guided
                 if not self._come_to_rest() or warnings:
@@ -252,7 +249,7 @@ class _Simulation:
 
     def _come_to_rest(self) -> bool:
         """Step until all objects are at rest; True if that happens within `MOST_STEPS`."""
-        mujoco, still = import_mujoco(), 0
+        mujoco, still = mujoco_models.import_mujoco(), 0
         for _ in range(MOST_STEPS):
             mujoco.mj_step(self.model, self.data)
             speed = self.data.qvel.reshape(-1, 2, 3)

@@ -16,13 +16,16 @@ from pathlib import Path
 
 import numpy as np
 
-from lidardesign.errors import DataError
-from lidardesign.run.arrays import csv_rows
-from lidardesign.run.inputs import TABLE
-from lidardesign.run.yaml import plain_number
-from lidardesign.scenes.rays import rotation_of_quaternion, rotation_of_rpy
-from lidardesign.scenes.scene import rigid
-from lidardesign.space import FARTHEST_M
+from lidardesign import (
+    FARTHEST_M,
+    DataError,
+    csv_rows,
+    inputs,
+    plain_number,
+    rigid,
+    rotation_of_quaternion,
+    rotation_of_rpy,
+)
 
 PLACE = ("x_m", "y_m", "z_m")
 QUATERNION = ("qw", "qx", "qy", "qz")
@@ -151,7 +154,7 @@ class _Row:
 
 def _rows(path: Path) -> list[tuple[int, list[str]]]:
     """Line and cells of every row that is not blank, the header first."""
-    rows = csv_rows(path, TABLE)
+    rows = csv_rows(path, inputs.TABLE)
     if not rows or len(rows) > MOST_ROWS + 1:
         raise DataError(f"{max(len(rows) - 1, 0)} rows", where=str(path), allowed=f"a header and 1 to {MOST_ROWS} rows")
     width = len(rows[0][1])

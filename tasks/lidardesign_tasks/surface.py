@@ -10,18 +10,19 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from lidardesign.rays.information import scattered_area_m2, surface_information
-from lidardesign.scenes.rays import Returns
-from lidardesign.scenes.scene import Mesh, Scene
-from lidardesign.scoring.metrics import (
-    SurfaceCloud,
-    delaunay_surface,
-    ray_spacing,
-    surface_cloud,
-    visible_surface,
+from lidardesign import (
+    DesignSpace,
+    Information,
+    Mesh,
+    Metric,
+    Returns,
+    Scene,
+    Score,
+    metrics,
+    random_generator,
+    scattered_area_m2,
+    surface_information,
 )
-from lidardesign.space import DesignSpace
-from lidardesign.task import Information, Metric, Score, random_generator
 
 MILLIMETRES = 1000.0
 RECONSTRUCTION_POINTS = 4000
@@ -78,9 +79,9 @@ class VisibleTruth(LazyTruth):
 
     key = "surface"
 
-    def find(self) -> SurfaceCloud:
+    def find(self) -> metrics.SurfaceCloud:
         """Compute the visible part of the targets."""
-        return visible_surface(self.scene, self.space, self.points, random_generator(self.seed, "truth"))
+        return metrics.visible_surface(self.scene, self.space, self.points, random_generator(self.seed, "truth"))
 
 
 def fewer_points(truth: Mapping[str, Any], count: int) -> Mapping[str, Any]:
@@ -96,7 +97,7 @@ def with_visible_truth(
     return replace(scene, truth=truth)
 
 
-def reconstruct(returns: Sequence[Returns], viewpoint_m: np.ndarray | None = None) -> SurfaceCloud | None:
+def reconstruct(returns: Sequence[Returns], viewpoint_m: np.ndarray | None = None) -> metrics.SurfaceCloud | None:
     """Surface through all returns, triangulated as seen from a viewpoint; `None` where they span none.
 
     It uses rays and returns only: a return from an occluder inside the gate is taken for surface, and there is no
@@ -114,13 +115,13 @@ def reconstruct(returns: Sequence[Returns], viewpoint_m: np.ndarray | None = Non
     viewpoint_m = origins.mean(axis=0) if viewpoint_m is None else viewpoint_m
     if is_one_place:
         # from their own origin, rays are seen in their directions at any range
-        spacing = [ray_spacing(frame.rays.direction)[frame.returned] for frame in returns]
+        spacing = [metrics.ray_spacing(frame.rays.direction)[frame.returned] for frame in returns]
     else:
         spacing = [_spacing(frame, viewpoint_m) for frame in returns]
-    surface = delaunay_surface(points, viewpoint_m, steepest_deg=STEEPEST_DEG, spacing=np.concatenate(spacing))
+    surface = metrics.delaunay_surface(points, viewpoint_m, steepest_deg=STEEPEST_DEG, spacing=np.concatenate(spacing))
     if surface is None:
         return None
-    return surface_cloud(*surface, RECONSTRUCTION_POINTS, random_generator(0, "reconstruction"))
+    return metrics.surface_cloud(*surface, RECONSTRUCTION_POINTS, random_generator(0, "reconstruction"))
 
 
 def _spacing(frame: Returns, viewpoint_m: np.ndarray) -> np.ndarray:
@@ -134,7 +135,7 @@ def _spacing(frame: Returns, viewpoint_m: np.ndarray) -> np.ndarray:
     range_m = np.where(hit, frame.range_m, np.median(frame.range_m[hit]))
     away = frame.rays.origin_m + range_m[:, None] * frame.rays.direction - viewpoint_m
     length = np.linalg.norm(away, axis=1, keepdims=True)
-    return ray_spacing(np.divide(away, length, out=np.zeros_like(away), where=length > 0))[hit]
+    return metrics.ray_spacing(np.divide(away, length, out=np.zeros_like(away), where=length > 0))[hit]
 
 
 def surface_score(metric: Metric, scene: Scene, returns: Sequence[Returns]) -> Score:
@@ -159,12 +160,14 @@ def surface_score(metric: Metric, scene: Scene, returns: Sequence[Returns]) -> S
     return Score(min(MILLIMETRES * float(missed.mean() + wrong.mean()), metric.worst), details=details)
 
 
-def surface_informs(scene: Scene, returns: Sequence[Returns]) -> Information:
+def surface_informs(scene: Scene, returns: Sequence[Returns], share: float) -> Information:
     """Information of returns about points of the visible surface, see `surface_information`."""
-    return information_of([fewer_points(scene.truth, ITEMS)["surface"]] * scene.frames, scene, returns)
+    return information_of([fewer_points(scene.truth, ITEMS)["surface"]] * scene.frames, scene, returns, share)
 
 
-def information_of(surfaces: Sequence[SurfaceCloud | None], scene: Scene, returns: Sequence[Returns]) -> Information:
+def information_of(
+    surfaces: Sequence[metrics.SurfaceCloud | None], scene: Scene, returns: Sequence[Returns], share: float
+) -> Information:
     """Information of returns about points of the visible surface of each frame, None where it has none."""
     points = [np.zeros((0, 3)) if surface is None else surface.points for surface in surfaces]
     counts = [importance_at(scene, places, frame) for frame, places in enumerate(points)]
@@ -175,6 +178,7 @@ def information_of(surfaces: Sequence[SurfaceCloud | None], scene: Scene, return
         [body.is_target for body in scene.bodies],
         sum(area_m2[one.frame] for one in returns),
         weight=[counts[one.frame] for one in returns],
+        share=share,
     )
 
 

@@ -13,9 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from lidardesign.scenes.scene import Ambient, Body, Medium, Scene
-from lidardesign.space import FARTHEST_M
-from lidardesign.task import TaskConfig
+from lidardesign import FARTHEST_M, Ambient, Body, Medium, Scene, TaskConfig
 
 # Contrast at the visibility, which defines it: exp(-extinction * visibility) = 0.02 (Koschmieder 1924).
 VISIBLE_CONTRAST = 0.02

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from lidardesign.space import RANGE, DesignSpace
+from lidardesign import RANGE, DesignSpace
 
 # Larger objects are probably in another unit, and so are longer paths, in extents of the moving object.
 DOUBTFUL_EXTENT_M, DOUBTFUL_WAY = 20.0, 50.0

@@ -9,9 +9,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import AfterValidator
 
-from lidardesign.numerics import circular_difference
-from lidardesign.space import DesignSpace, aim
-from lidardesign.task import Metres, Vector
+from lidardesign import DesignSpace, Metres, Vector, aim, circular_difference
 
 
 def _half_size(value: float | Vector) -> float | Vector:

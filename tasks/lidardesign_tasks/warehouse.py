@@ -14,11 +14,20 @@ from typing import ClassVar, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from lidardesign.errors import ConfigError
-from lidardesign.scenes.rays import Returns
-from lidardesign.scenes.scene import Scene
-from lidardesign.space import DIMENSIONS, DesignSpace, X
-from lidardesign.task import Defaults, Information, Interval, Metric, Score, Split, conditions_of, random_generator
+from lidardesign import (
+    DIMENSIONS,
+    ConfigError,
+    Defaults,
+    DesignSpace,
+    Information,
+    Interval,
+    Metric,
+    Returns,
+    Scene,
+    Score,
+    Split,
+    random_generator,
+)
 from lidardesign_tasks.surroundings import Surroundings
 from lidardesign_tasks.warehouse_shelf import ShelfPlan, build_shelf
 from lidardesign_tasks.warehouse_truth import BoxTruth, box_information, miss_score
@@ -26,6 +35,7 @@ from lidardesign_tasks.warehouse_truth import BoxTruth, box_information, miss_sc
 AISLE_M = (-0.5, 4.0)
 PAPER_POSITIONS_M = (0.0, 1.2, 2.4, 3.6)
 # The density is conditioned on x; rays in one vertical plane need the others fixed.
+X = DIMENSIONS.index("x_m")
 FIXED_DIMENSIONS = ("y_m", "z_m", "azimuth_rad")
 MAXIMUM_DRAWS = 100  # attempts to draw a shelf with a visible box
 
@@ -126,7 +136,7 @@ class WarehouseTask:
         """
         space = space or self.space(config)
         _check_space(space)
-        origins = [space.at(one).low[:3] for one in conditions_of(self, config, space)]
+        origins = [space.at(one).low[:3] for one in (self.conditions(config) if space.conditioned else [{}])]
         shelves = [
             _visible_shelf(config.plan, space, np.array(origins), split, seed, index)
             for index in range(config.count(split))

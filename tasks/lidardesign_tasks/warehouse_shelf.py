@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from typing import Literal
 
 import numpy as np
 
-from lidardesign.scenes.scene import Body, Box, Role, rigid
-from lidardesign.task import Interval
+from lidardesign import Body, Box, Interval, rigid
 
 LEVELS = 4
 BOARD_THICKNESS_M = 0.06  # the board with the beam that carries it
@@ -104,7 +104,7 @@ class _Block:
     depth: Interval
     height: Interval
 
-    def body(self, name: str, role: Role, pose: np.ndarray) -> Body:
+    def body(self, name: str, role: Literal["occluder", "both"], pose: np.ndarray) -> Body:
         """The block as a body in the world, for a pose of the shelf whose -y is depth."""
         low = np.array([self.along[0], -self.depth[1], self.height[0]])
         high = np.array([self.along[1], -self.depth[0], self.height[1]])

@@ -14,11 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from lidardesign.errors import ConfigError
-from lidardesign.scenes.rays import Returns
-from lidardesign.scenes.scene import Scene
-from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace
-from lidardesign.task import Information, Metric, Score
+from lidardesign import AZIMUTH, ELEVATION, RANGE, ConfigError, DesignSpace, Information, Metric, Returns, Scene, Score
 
 PERCENT = 100.0
 # Largest step between neighbouring elevations, to which the ends of the design space's range cut faces.

@@ -11,6 +11,7 @@ from support.small_runs import shifted
 
 import lidardesign
 from lidardesign.errors import ConfigError, DataError, InfeasibleError
+from lidardesign.run_folder import RunFolder
 from lidardesign.samples import load_samples
 
 SMALL = {
@@ -196,6 +197,13 @@ def test_one_kind_of_progress_says_how_far_everything_has_come(tmp_path):
     assert said[-1] == ("choosing 8 rays", None, None)
     run.evaluate([design], rays=[8], baselines=["none"], progress=lambda *now: said.append(now))
     assert said[-1][1:] == (2, 2)
+
+
+def test_without_baselines_no_training_scene_is_made(run, monkeypatch):
+    design, splits, scenes = run.fit(sensors=1, rays=8, layout="even"), [], RunFolder.scenes
+    monkeypatch.setattr(RunFolder, "scenes", lambda own, split, seed: splits.append(split) or scenes(own, split, seed))
+    run.evaluate([design], rays=[8], baselines=["none"])
+    assert splits == ["test"]
 
 
 def test_steps_are_not_counted_down_where_time_decides(tmp_path):

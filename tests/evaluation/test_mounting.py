@@ -135,7 +135,7 @@ def test_over_seeds_rows_and_costs_are_means():
     assert over_seeds([replace(each, mounting=None) for each in single], (0, 1, 2), 7).mounting is None
 
 
-def test_the_command_shows_what_careless_mounting_costs(lidardesign, tmp_path):
+def test_the_command_shows_what_mounting_errors_cost(lidardesign, tmp_path):
     run = make_run(tmp_path / "run", count=1000)
     open_run(run).fit(layout="even", sensors=2, name="two").save()
     options = ("evaluate", run, "--rays", 16, "--set", "test=2", "--baseline", "uniform", "--mount-error")

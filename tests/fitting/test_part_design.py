@@ -286,7 +286,7 @@ def test_fit_prints_parts_and_evaluate_takes_them(lidardesign, run):
 # what parts tell, without a task
 
 
-def every_return(scene, returns):
+def every_return(scene, returns, share=None):
     """Every ray tells about one item, its tenth of azimuth, by its range."""
     rays = returns[0].rays
     tenth = np.mod(np.arctan2(rays.direction[:, 1], rays.direction[:, 0]) * 10 / (2 * np.pi), 10).astype(int)

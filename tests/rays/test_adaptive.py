@@ -20,7 +20,7 @@ from lidardesign.rays.adaptive import Frames, PatternSearch
 from lidardesign.rays.choice import RayCounts, choose, choose_within
 from lidardesign.rays.information import features_of
 from lidardesign.rays.selection import Selection
-from lidardesign.rays.training_scenes import InformedScene
+from lidardesign.rays.training_scenes import SceneInformation
 from lidardesign.scenes.rays import Outcome, Returns
 from lidardesign.sensors.adaptive import AdaptiveRays, PatternRule, mapped, mean_mbps, returns_of
 from lidardesign.sensors.bandwidth import Bandwidth
@@ -174,7 +174,7 @@ def frame_of(kind, generator):
     range_m[told] = generator.uniform(1.2, 1.8, len(told))
     range_m[0] = 1.2 + 0.5 * kind + generator.uniform(0, 0.05)
     information = Information(told, np.arange(6), np.array([2.0, 1.9, 1, 1, 1, 1]), np.zeros(6, int), complete=2.0)
-    return InformedScene.of(information, [SimpleNamespace(range_m=range_m)]), range_m
+    return SceneInformation.of(information, [SimpleNamespace(range_m=range_m)]), range_m
 
 
 def frames_of_kinds(kinds, seed, features=None):

@@ -15,7 +15,7 @@ from support.coverages import SUMS, relaxed_by_highs, small
 from lidardesign.errors import PluginError
 from lidardesign.rays.certificate import certify
 from lidardesign.rays.choice import RayCounts, choose, choose_within
-from lidardesign.rays.coverage import LARGEST, InformedScene, gather
+from lidardesign.rays.coverage import LARGEST, SceneInformation, gather
 from lidardesign.rays.information import require_valid
 from lidardesign.task import Information
 
@@ -237,7 +237,7 @@ def test_of_what_a_ray_tells_in_several_frames_the_largest_counts_that_a_gate_le
     returns = [SimpleNamespace(range_m=generator.uniform(1, 2, rays)) for _ in range(frames)]
     gates_m = np.sort(generator.uniform(1, 2, (rays, gates, 2)), axis=2)
     information = Information(ray, item, worth, np.arange(items) % frames, seen_in=seen_in)
-    coverage = gather([InformedScene.of(information, returns)], gates_m, np.zeros((rays, gates)))
+    coverage = gather([SceneInformation.of(information, returns)], gates_m, np.zeros((rays, gates)))
     for one, gate in itertools.product(range(rays), range(gates)):
         most = np.zeros(items)
         for e in np.flatnonzero(ray == one):

@@ -13,11 +13,13 @@ from support.rays import rays_along
 from lidardesign.rays.information import (
     CHOSEN_SHARE,
     REACH_SPACINGS,
+    checked_information,
     return_reach_m,
     scattered_area_m2,
     surface_information,
 )
 from lidardesign.scenes.rays import Outcome, Returns
+from lidardesign.scenes.scene import Body, Scene, Sphere
 
 seeds = st.integers(0, 10_000)
 SIDE_M, HEIGHT_M = 0.3, 1.0
@@ -89,6 +91,20 @@ def test_the_reach_is_so_many_spacings_of_the_candidates(dimensions, spacings):
     # of what is chosen it is the same number of spacings in any dimension
     chosen = CHOSEN_SHARE * 3**dimensions
     assert return_reach_m(1.0, 3**dimensions, dimensions) * chosen ** (1 / dimensions) == pytest.approx(math.sqrt(5))
+
+
+def test_the_share_that_will_be_chosen_sets_the_reach_where_a_task_asks_for_it():
+    (points, returns, _), scene = random_look(0), Scene((Body(Sphere(1.0), "ball", "target"),))
+
+    class Asking:
+        name = "asking"
+
+        def informs(self, scene, returns, share):
+            return surface_information([points], returns, [True, False], SIDE_M**2, share=share)
+
+    usual, all_chosen = (checked_information(Asking(), scene, [returns], share) for share in (CHOSEN_SHARE, 1.0))
+    assert usual.complete == surface_information([points], [returns], [True, False], SIDE_M**2).complete
+    assert all_chosen.complete == pytest.approx(math.sqrt(CHOSEN_SHARE) * usual.complete)
 
 
 @pytest.mark.parametrize("body", [OCCLUDER, NOTHING])

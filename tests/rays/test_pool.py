@@ -18,7 +18,7 @@ from lidardesign.api.run import open_run
 from lidardesign.config import resolve
 from lidardesign.rays import pool
 from lidardesign.rays.pool import FILE_NAME, pool_of
-from lidardesign.rays.training_scenes import InformedScene, TrainingScenes
+from lidardesign.rays.training_scenes import SceneInformation, TrainingScenes
 from lidardesign.run_folder import RunFolder
 from lidardesign.samples import load_samples, save_samples
 from lidardesign.sensors.design_file import design_document
@@ -56,7 +56,9 @@ def found(folder, seed=3, **changes):
 
 def bits(kept):
     """All that a pool holds, to the bit and with its types."""
-    scenes = [getattr(scene, one.name) for scene in (*kept.informed, *kept.held_back) for one in fields(InformedScene)]
+    scenes = [
+        getattr(scene, one.name) for scene in (*kept.informed, *kept.held_back) for one in fields(SceneInformation)
+    ]
     arrays = [np.asarray(value) for value in (kept.points, *scenes)]
     return [*((array.dtype, array.shape, array.tobytes()) for array in arrays), kept.visits, len(kept.informed)]
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from support.coverages import scene_of
 from support.rays import random_fan, rays_along
 
-from lidardesign.rays.coverage import LARGEST, InformedScene, gather
+from lidardesign.rays.coverage import LARGEST, SceneInformation, gather
 from lidardesign.rays.gates import SENSOR_LEVELS, gate_choices, sensor_gates
 from lidardesign.rays.selection import _shared_gates
 from lidardesign.task import Information
@@ -32,7 +32,7 @@ def cast(seed, silent=()):
         range_m = generator.uniform(0.5, 1.5, 12) + 0.6 * rays.sensor
         ray = np.flatnonzero((generator.uniform(size=12) < 0.8) & ~np.isin(rays.sensor, silent))
         told = Information(ray, np.arange(len(ray)), np.ones(len(ray)), np.zeros(12, dtype=int))
-        informed.append(InformedScene.of(told, [SimpleNamespace(range_m=range_m)]))
+        informed.append(SceneInformation.of(told, [SimpleNamespace(range_m=range_m)]))
     return rays, informed
 
 

@@ -31,20 +31,18 @@ from lidardesign.report.scene_figure import (
     MOST_FACES,
     MOST_RAY_STEPS,
     MOST_STEPS,
-    STEPS,
     SceneFigure,
-    body_triangles,
     drawn_share,
     frustum_lines,
     gate_shell,
     origin_lines,
     round_steps,
-    thinned,
 )
 from lidardesign.report.sections import CommandTimes, constraints_section, scores_section, times_section
 from lidardesign.report.view import MOST_BODIES, MOST_SENSORS, drawn_bodies, view_bounds, view_document, view_notes
 from lidardesign.run.markup import rendered
 from lidardesign.scenes.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Scene, Sphere, rigid
+from lidardesign.scenes.triangulation import STEPS, body_triangles, thinned
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.task import Metric
 

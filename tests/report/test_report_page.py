@@ -14,8 +14,9 @@ from support.browsers import opened_browser
 from support.report_pages import FRAMES, NASTY, PLACES, make_report
 
 from lidardesign.report.page import report_html
-from lidardesign.report.scene_figure import body_triangles, frustum_lines, origin_lines, scene_bounds
+from lidardesign.report.scene_figure import frustum_lines, origin_lines
 from lidardesign.scenes.rays import Outcome
+from lidardesign.scenes.triangulation import body_triangles, scene_bounds
 
 WAIT_MS = 120_000  # software that draws in 3D on a busy machine takes its time
 DRAWN = "html[data-drawn]"

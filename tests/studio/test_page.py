@@ -95,7 +95,7 @@ def test_a_sensor_that_is_dragged_takes_its_rays_along_and_is_fixed_in_every_tab
         np.testing.assert_allclose(after.design.rays(16).direction, kept, rtol=0, atol=1e-12)
         for one in (tab, other):
             one.page.get_by_text("fixed: place").wait_for()
-            one.page.get_by_text("than before the last change").wait_for()
+            one.page.get_by_text("before the last change").wait_for()
             assert float(one.field("x, y, z [m]").input_value().split(",")[0]) == pytest.approx(moved[0], abs=6e-4)
         tab.page.get_by_role("button", name="Undo", exact=True).click()
         wait_for(lambda: studio.choices is before)

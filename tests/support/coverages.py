@@ -8,7 +8,7 @@ import numpy as np
 from scipy.optimize import Bounds, LinearConstraint, milp
 from scipy.sparse import coo_array
 
-from lidardesign.rays.coverage import LARGEST, Coverage, InformedScene, gather
+from lidardesign.rays.coverage import LARGEST, Coverage, SceneInformation, gather
 from lidardesign.task import Information
 
 SUMS = np.array([0.0, 1.0, 1.6, 1.9, 2.0])
@@ -23,7 +23,7 @@ def scene_of(generator, rays, items, pairs, table):
     sums = None if len(table) == 0 else table
     returns = SimpleNamespace(range_m=generator.uniform(1, 2, rays))
     information = Information(ray, item, worth, frame, weight, sums=sums, complete=max(table, default=1.0))
-    return InformedScene.of(information, [returns])
+    return SceneInformation.of(information, [returns])
 
 
 def small(seed, rays=7, gates=2, items=12, scenes=3, table=LARGEST, harm=0.0):

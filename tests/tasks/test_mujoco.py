@@ -21,7 +21,7 @@ from lidardesign.contract import contract_of
 from lidardesign.contract.contract import LAWS
 from lidardesign.density.training.learn import prepare_training_data
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.rays.information import require_valid
+from lidardesign.rays.information import checked_information
 from lidardesign.run.manifest import note, start_manifest
 from lidardesign.run_folder import RunFolder, input_hashes
 from lidardesign.scenes.rays import Outcome, Returns
@@ -432,8 +432,8 @@ def test_what_is_not_known_is_mistaken_for_the_target(resting):
     apart, alike = simulate(told_apart, rays), simulate(mistaken, rays)
     assert (apart[0].body != target).any()
     assert TASK.score(told_apart, apart).value < TASK.score(mistaken, alike).value
-    assert TASK.informs(told_apart, apart).harm.max() == 0
-    assert TASK.informs(mistaken, alike).harm.max() > 0
+    assert checked_information(TASK, told_apart, apart).harm.max() == 0
+    assert checked_information(TASK, mistaken, alike).harm.max() > 0
 
 
 def test_seen_counts_targets_and_frames_with_a_return(resting):
@@ -449,8 +449,7 @@ def test_a_surface_that_no_sensor_can_see_is_lost_and_tells_nothing(resting):
     (scene, *_) = resting(metric="surface", mount_body="base", origin_m=(-0.2, 0.0, 0.0), train=1, frames=2)
     returns = simulate(scene, rays_of_points(np.array([[-0.2, 0.0, 0.0, 0.0, 0.0, 1.0]]), (0.0, 10.0)))
     assert TASK.score(scene, returns).failed
-    told = TASK.informs(scene, returns)
-    require_valid(told, 1, 2)
+    told = checked_information(TASK, scene, returns)
     assert len(told.worth) == 0
 
 
@@ -482,6 +481,6 @@ def test_targets_of_a_model_of_others_are_found_and_tell(name):
     returns = simulate(scene, rays_of_points(points, (0.0, 1e3)))
     targets = {index for index, body in enumerate(scene.bodies) if body.is_target}
     assert targets & set(np.concatenate([one.body for one in returns]).tolist())
-    informed = TASK.informs(scene, returns)
+    informed = checked_information(TASK, scene, returns)
     assert informed.worth.max() > 0
     assert np.isfinite(TASK.score(scene, returns).value)

@@ -17,6 +17,7 @@ from support.meshes import write_ball
 from support.rays import rays_of_points
 
 from lidardesign.errors import DataError
+from lidardesign.rays.information import checked_information
 from lidardesign.scenes.scene import Box, Mesh
 from lidardesign.simulate.returns import simulate
 from lidardesign.space import aim
@@ -163,12 +164,12 @@ def test_returns_on_the_background_tell_nothing_and_spoil_nothing(folder):
     scene = task.scenes(config, "train", 0, space)[0]
     design = space.sample(2000, np.random.default_rng(1))
     rays = rays_of_points(design, (0.0, space.high[5]))
-    information = task.informs(scene, simulate(scene, rays))
+    information = checked_information(task, scene, simulate(scene, rays))
     assert len(information.ray)
     assert not information.harm.any()
     config = task.Config(**{**config.model_dump(), "background_returns": "stay"})
     (scene, *_) = task.scenes(config, "train", 0, space)
-    assert task.informs(scene, simulate(scene, rays)).harm.any()
+    assert checked_information(task, scene, simulate(scene, rays)).harm.any()
 
 
 def test_a_pile_shows_the_mesh_of_its_scene_and_others_of_its_split_alone(folder):

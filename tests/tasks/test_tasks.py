@@ -21,7 +21,7 @@ from support.rays import rays_of_points
 from lidardesign.contract import contract_of
 from lidardesign.contract.contract import LAWS
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.rays.coverage import InformedScene, gather
+from lidardesign.rays.coverage import SceneInformation, gather
 from lidardesign.rays.information import checked_information
 from lidardesign.run.content import fingerprint
 from lidardesign.scenes.rays import Outcome, Rays, Returns
@@ -136,7 +136,7 @@ def test_a_score_reads_rays_and_ranges_alone(case, name):
 def told_by(information, returns, rays):
     """What a choice of the candidates, at these indices, knows of what there is to know, from 0 to 1."""
     count = len(returns[0].rays)
-    informed, open_gates = InformedScene.of(information, returns), np.tile([0.0, np.inf], (count, 1, 1))
+    informed, open_gates = SceneInformation.of(information, returns), np.tile([0.0, np.inf], (count, 1, 1))
     coverage = gather([informed], open_gates, np.zeros((count, 1)))
     gate = np.full(count, -1)
     gate[rays] = 0

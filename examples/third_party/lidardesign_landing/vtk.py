@@ -1,8 +1,7 @@
 """The format `vtk`: every ray as a line from its origin through its gate, in metres, for ParaView."""
 
 import numpy as np
-from lidardesign import Format, Rig, RigSensor
-from lidardesign.errors import DataError
+from lidardesign import DataError, Format, Rig, RigSensor
 
 HEAD = "# vtk DataFile Version 3.0\nrays: origin, start and end of the gate [m]\nASCII\nDATASET POLYDATA\nPOINTS "
 

@@ -134,8 +134,15 @@ def _show_mounting(document: Entry, rich: RichConsole, shown: Sequence[bool]) ->
     for row, own in compress(zip(found["rows"], exact, strict=True), shown):
         figures = map(number, (row["rays"], own["value"], row["value"], row["failures"]))
         lines.append([row["design"], *figures, difference_cell(row["cost"])])
-    headings = ("design", "rays", f"exact\n[{unit}]", f"careless\n[{unit}]", "failures", "difference (95 % interval)")
-    print_table(f"mounted carelessly: every sensor off by {off} per axis", headings, lines, rich)
+    headings = (
+        "design",
+        "rays",
+        f"exact\n[{unit}]",
+        f"with errors\n[{unit}]",
+        "failures",
+        "difference (95 % interval)",
+    )
+    print_table(f"with mounting errors: every sensor off by {off} per axis", headings, lines, rich)
 
 
 def _audit_title(audit: Entry, effects: Sequence[Entry]) -> str:

@@ -276,12 +276,12 @@ class Counts:
         share = safe_divide(middle, self.share_in_bins(self.pulse_bins, sigma_m), 1.0)
         return self.more_missed(Echo(signal * share, sigma_m), Echo(signal, sigma_m))
 
-    def sunk(self) -> np.ndarray:
+    def slant_loss(self) -> np.ndarray:
         """Increase of the probability that an echo is missed because a slanted beam spreads it, shape (N,)."""
         timed_m = np.full(len(self.first_hits), metres(self.first_hits.detector.timing_sigma_s))
         return self.more_missed(Echo(self.in_air, timed_m), Echo(self.in_air, self.first_hits.sigma_m()))
 
-    def by_chance(self, blind: Blindness, sigma_m: np.ndarray) -> np.ndarray:
+    def false_return_probability(self, blind: Blindness, sigma_m: np.ndarray) -> np.ndarray:
         """Probability that background is taken for the echo, or background or haze for a missing one, shape (N,)."""
         any_haze = -np.expm1(-self.pulses * self.haze_per_pulse[0])
         any_count = -np.expm1(-self.per_bin * self.bins)

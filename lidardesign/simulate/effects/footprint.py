@@ -102,7 +102,7 @@ def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
     lost = np.maximum(edge, (first_hits.gate_edge_m <= spread_m) | stray_rims(first_hits))
     lost = np.maximum(lost, counts.spilled(spread_m))
     if first_hits.detector.photons is not None:
-        lost = np.maximum(lost, counts.sunk() * first_hits.returned)
+        lost = np.maximum(lost, counts.slant_loss() * first_hits.returned)
     wide_m = float(np.median(2 * radius_m[first_hits.returned])) if first_hits.returned.any() else 0.0
     return EffectBound(
         squared, lost, f"beams of {1000 * wide_rad:.3g} mrad are {1000 * wide_m:.3g} mm wide where they return"

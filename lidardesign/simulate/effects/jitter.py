@@ -60,7 +60,9 @@ def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
     squared = squared + ((both_m - pulse_m) * blind.early) ** 2
     lost = counts.more_missed(Echo(signal, pulse_m), Echo(signal, both_m))
     # photons that change bins make background win, or not any more
-    lost = lost + np.minimum(signal * metres(sigma_s) / counts.bin_m, 1.0) * counts.by_chance(blind, both_m)
+    lost = lost + np.minimum(signal * metres(sigma_s) / counts.bin_m, 1.0) * counts.false_return_probability(
+        blind, both_m
+    )
     spilled = -np.expm1(-np.maximum(counts.leaked(both_m) - counts.leaked(pulse_m), 0.0))
     return EffectBound(
         squared,

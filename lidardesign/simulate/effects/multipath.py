@@ -191,7 +191,7 @@ class _View:
         """The spots of all rays as lights."""
         reflectance = reflectances(self.scene, self.hits)
         half_angle_rad = max(self.detector.divergence_rad / 2, math.sqrt(self.pixel_sr / math.pi))
-        return Lights.beams(self.hits, self.rays, reflectance, radius_m=half_angle_rad * self.hits.range_m)
+        return Lights.beams(self.hits, self.rays, reflectance, half_angle_rad * self.hits.range_m)
 
     def rendered(self, lights: Lights, **options: object) -> Transients:
         """Radiance along the rays' looks from these lights."""

@@ -42,5 +42,7 @@ def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
         sigma_m, blind = first_hits.sigma_m(), Blindness.of(counts)
         if first_hits.detector.estimator == "peak":
             squared = squared + 2 * counts.error_m(blind.left, sigma_m) ** 2
-        lost = np.minimum(2 * counts.by_chance(blind, sigma_m) + counts.missed_on_edges(blind.left, sigma_m), 1.0)
+        lost = np.minimum(
+            2 * counts.false_return_probability(blind, sigma_m) + counts.missed_on_edges(blind.left, sigma_m), 1.0
+        )
     return EffectBound(squared, lost, f"bins are {1000 * bin_m:.3g} mm wide")

@@ -142,24 +142,21 @@ class Lights:
     lead_m: np.ndarray
 
     @classmethod
-    def beams(
-        cls, hits: Hits, rays: Rays, reflectance: np.ndarray, *, watts: float = 1.0, radius_m: np.ndarray | None = None
-    ) -> Lights:
-        """Patches lit by thin beams: matt points at first hits with the reflected power.
+    def beams(cls, hits: Hits, rays: Rays, reflectance: np.ndarray, radius_m: np.ndarray) -> Lights:
+        """Patches lit by thin beams of 1 W each: matt points at first hits with the reflected power.
 
         Arguments:
             hits: First hits of the rays; all of them hit something.
             rays: The beams, M of them.
             reflectance: Reflectance at each hit, shape (M,).
-            watts: Power of each beam [W].
             radius_m: Radius of each patch [m], shape (M,).
         """
         return replace(
             cls.everywhere(rays.origin_m + hits.range_m[:, None] * rays.direction, hits.normal, 1.0),
-            intensity=watts * reflectance / math.pi,
+            intensity=reflectance / math.pi,
             least_cosine=np.zeros(len(rays)),
             lambertian=np.ones(len(rays), dtype=bool),
-            radius_m=np.zeros(len(rays)) if radius_m is None else radius_m,
+            radius_m=radius_m,
             lead_m=hits.range_m,
         )
 

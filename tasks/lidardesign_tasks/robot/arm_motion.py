@@ -10,10 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from lidardesign.errors import ConfigError, DataError
-from lidardesign.scenes.mujoco_models import import_mujoco, mujoco_warnings
-from lidardesign.scenes.scene import Capsule, Mesh, Shape, Sphere
-from lidardesign.scenes.surface import half_extents_m
+from lidardesign import Capsule, ConfigError, DataError, Mesh, Shape, Sphere, half_extents_m, mujoco_models
 from lidardesign_tasks.robot.arm_robot import BALL, BALL_RADIUS_M, Robot
 from lidardesign_tasks.robot.motion import minimum_jerk
 
@@ -101,7 +98,7 @@ class Arm:
     """A robot arm with the state for inverse kinematics."""
 
     def __init__(self, robot: Robot, ceiling_m: float) -> None:
-        self.robot, self.mink, self.mujoco = robot, import_mink(), import_mujoco()
+        self.robot, self.mink, self.mujoco = robot, import_mink(), mujoco_models.import_mujoco()
         mink = self.mink
         self.highest_m = ceiling_m - CLEARANCE_M
         self.configuration = mink.Configuration(robot.model)
@@ -133,7 +130,7 @@ class Arm:
 
     def follow(self, waypoints: np.ndarray, frames: int, rate_hz: float, rejected: Counter[str]) -> Motion:
         """The motion along way-points of the ball; raises `RejectedError`."""
-        with mujoco_warnings():
+        with mujoco_models.mujoco_warnings():
             joints = self._solve(waypoints, frames)
             time_s = np.arange(frames) / rate_hz
             ball, links = self._forward(joints, rate_hz)

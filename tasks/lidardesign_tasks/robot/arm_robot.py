@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lidardesign.errors import DataError
-from lidardesign.scenes.mujoco_models import FileState, ModelGeom, import_mujoco, load_model, model_files, visible_geoms
+from lidardesign import DataError, mujoco_models
 from lidardesign_tasks.robot.targets import without_notes
 
 if TYPE_CHECKING:
@@ -43,7 +42,7 @@ class Robot:
     """
 
     model: mujoco.MjModel
-    links: tuple[ModelGeom, ...]
+    links: tuple[mujoco_models.ModelGeom, ...]
     home_rad: np.ndarray
     notes: tuple[str, ...]
 
@@ -60,21 +59,21 @@ def load_robot(path: Path | None, tool_m: float) -> Robot:
         ConfigError: MuJoCo is not installed.
     """
     if path is not None:
-        return _read_once(path, model_files(path), tool_m)
+        return _read_once(path, mujoco_models.model_files(path), tool_m)
     with as_file(files("lidardesign_tasks") / "data" / "iiwa14.xml") as embedded:
         return _read_once(embedded, (), tool_m)
 
 
 @lru_cache(maxsize=4)
-def _read_once(path: Path, states: tuple[FileState, ...], tool_m: float) -> Robot:
+def _read_once(path: Path, states: tuple[mujoco_models.FileState, ...], tool_m: float) -> Robot:
     """Read an arm; `states` of its files are part of the cache key, so that a changed model is read again."""
-    model, warnings = load_model(path, edit=lambda spec: _add_tool(_flange(spec, path), tool_m))
+    model, warnings = mujoco_models.load_model(path, edit=lambda spec: _add_tool(_flange(spec, path), tool_m))
     _check_chain(model, path)
     links, notes = seen_links(model, path)
     return Robot(model, links, _home(model), (*warnings, *notes))
 
 
-def seen_links(model: mujoco.MjModel, path: Path) -> tuple[tuple[ModelGeom, ...], tuple[str, ...]]:
+def seen_links(model: mujoco.MjModel, path: Path) -> tuple[tuple[mujoco_models.ModelGeom, ...], tuple[str, ...]]:
     """Visible pieces of an arm without its ball, the tool last, and notes on repairs and omissions.
 
     They are the geoms of the visual group, or all geoms where only tool and ball are in it.
@@ -83,7 +82,7 @@ def seen_links(model: mujoco.MjModel, path: Path) -> tuple[tuple[ModelGeom, ...]
         DataError: The arm has no visible shapes.
     """
     visual = int((model.geom_group == VISUAL_GROUP).sum()) > len((BALL, TOOL))
-    pieces, notes = visible_geoms(model, groups=(VISUAL_GROUP,) if visual else range(GROUPS))
+    pieces, notes = mujoco_models.visible_geoms(model, groups=(VISUAL_GROUP,) if visual else range(GROUPS))
     own = [piece for piece in pieces if piece.body and piece.geom_name not in (BALL, TOOL)]
     if not own:
         raise DataError("the arm has no visible shapes", where=str(path), allowed="geoms of group 2 on its links")
@@ -105,7 +104,7 @@ def _flange(spec: Any, path: Path) -> Any:
 
 def _add_tool(flange: Any, tool_m: float) -> None:
     """Fix the tool and the ball to the flange: the site `FLANGE_SITE` of the last link, or the link's frame."""
-    mujoco = import_mujoco()
+    mujoco = mujoco_models.import_mujoco()
     site = next((site for site in flange.sites if site.name == FLANGE_SITE), None)
     start = np.zeros(3) if site is None else np.array(site.pos)
     quaternion = np.array([1.0, 0.0, 0.0, 0.0]) if site is None else np.array(site.quat)
@@ -123,7 +122,7 @@ def _add_tool(flange: Any, tool_m: float) -> None:
 
 
 def _check_chain(model: mujoco.MjModel, path: Path) -> None:
-    hinges = int((model.jnt_type == int(import_mujoco().mjtJoint.mjJNT_HINGE)).sum())
+    hinges = int((model.jnt_type == int(mujoco_models.import_mujoco().mjtJoint.mjJNT_HINGE)).sum())
     if model.njnt != JOINTS or hinges != JOINTS:
         found = f"has {model.njnt} joints, {hinges} of them hinges"
         raise DataError(found, where=str(path), allowed=CHAIN, hint=CHAIN_HINT)
@@ -137,7 +136,7 @@ def _check_chain(model: mujoco.MjModel, path: Path) -> None:
 
 def _home(model: mujoco.MjModel) -> np.ndarray:
     """The keyframe `home`, else the first one, else the posture of the embedded arm; within the joints' limits."""
-    mujoco, home = import_mujoco(), np.array(HOME_RAD)
+    mujoco, home = mujoco_models.import_mujoco(), np.array(HOME_RAD)
     if model.nkey:
         key = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, "home")
         home = np.array(model.key_qpos[max(key, 0)])

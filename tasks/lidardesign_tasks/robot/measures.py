@@ -12,11 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from lidardesign.errors import DataError
-from lidardesign.scenes.rays import Outcome, Returns
-from lidardesign.scenes.scene import Scene
-from lidardesign.space import DesignSpace
-from lidardesign.task import Information, Metric, Score
+from lidardesign import DataError, DesignSpace, Information, Metric, Outcome, Returns, Scene, Score
 from lidardesign_tasks.moving_surface import SURFACES, moving_informs, moving_score, with_moving_truth
 from lidardesign_tasks.robot.targets import Model
 from lidardesign_tasks.robot.tracking import FEWEST_FRAMES, filled_path, path_information, tracked_places
@@ -38,9 +34,10 @@ def with_truth(scene: Scene, model: Model, poses: np.ndarray, measure: Measure, 
     target_of = np.full(len(model.pieces) + 1, -1)  # of the body -1, too
     for number, target in enumerate(model.targets):
         target_of[target.pieces] = number
+    places_m = model.places_m(poses[: scene.frames])  # a scene at rest has one frame, however long its motion
     truth = {
         "measure": measure, "metric": metric, "target_of": target_of, "known": np.append(model.known, False),
-        "places_m": model.places_m(poses), "depths_m": np.array([target.depth_m for target in model.targets]),
+        "places_m": places_m, "depths_m": np.array([target.depth_m for target in model.targets]),
     }  # fmt: skip
     if measure == "surface":
         return with_moving_truth(scene, space, TRUTH_POINTS, generator, **truth)
@@ -52,9 +49,9 @@ def score(scene: Scene, returns: Sequence[Returns]) -> Score:
     return _SCORES[scene.truth["measure"]](scene, [_told_apart(scene, one) for one in returns])
 
 
-def informs(scene: Scene, returns: Sequence[Returns]) -> Information:
+def informs(scene: Scene, returns: Sequence[Returns], share: float) -> Information:
     """Information of returns by the scene's own measure."""
-    return _INFORMS[scene.truth["measure"]](scene, [_told_apart(scene, one) for one in returns])
+    return _INFORMS[scene.truth["measure"]](scene, [_told_apart(scene, one) for one in returns], share)
 
 
 def features(scene: Scene, returns: Returns) -> np.ndarray:
@@ -96,7 +93,7 @@ def _position_score(scene: Scene, returns: Sequence[Returns]) -> Score:
     return Score(value, failed=not any(seen), details={"seen_percent": 100.0 * float(np.mean(seen))})
 
 
-def _position_informs(scene: Scene, returns: Sequence[Returns]) -> Information:
+def _position_informs(scene: Scene, returns: Sequence[Returns], share: float) -> Information:
     count = max(sum(int(one.returned.sum()) for one in returns), 1)
     harm = np.stack([_taken_for(scene, one)[1] for one in returns]) / count
     least_m = float(scene.truth["depths_m"].max())
@@ -115,7 +112,7 @@ def _seen_score(scene: Scene, returns: Sequence[Returns]) -> Score:
     return Score(100.0 * float(np.mean([len(np.unique(target)) / targets for _, target in _seen(scene, returns)])))
 
 
-def _seen_informs(scene: Scene, returns: Sequence[Returns]) -> Information:
+def _seen_informs(scene: Scene, returns: Sequence[Returns], share: float) -> Information:
     """Full information of every return on a target about its own frame."""
     targets, hits = len(scene.truth["places_m"]), _seen(scene, returns)
     ray = np.concatenate([ray for ray, _ in hits])
@@ -142,9 +139,9 @@ def _surface_score(scene: Scene, returns: Sequence[Returns]) -> Score:
     return Score(metric.worst, failed=True) if _is_hidden(scene) else moving_score(metric, scene, returns)
 
 
-def _surface_informs(scene: Scene, returns: Sequence[Returns]) -> Information:
+def _surface_informs(scene: Scene, returns: Sequence[Returns], share: float) -> Information:
     if not _is_hidden(scene):
-        return moving_informs(scene, returns)
+        return moving_informs(scene, returns, share)
     none = np.zeros(0, dtype=np.int64)
     return Information(none, none, np.zeros(0), np.zeros(1, dtype=np.int64), unit="m")
 

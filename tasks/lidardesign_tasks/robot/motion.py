@@ -9,9 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lidardesign.errors import DataError
-from lidardesign.scenes.mujoco_models import import_mujoco, mujoco_warnings
-from lidardesign.task import Split, random_generator
+from lidardesign import DataError, Split, mujoco_models, random_generator
 from lidardesign_tasks.robot.recordings import Recording
 
 if TYPE_CHECKING:
@@ -51,7 +49,7 @@ def minimum_jerk(share: np.ndarray) -> np.ndarray:
 
 def joined(model: mujoco.MjModel, start: np.ndarray, end: np.ndarray, share: np.ndarray) -> np.ndarray:
     """Minimum-jerk path between two configurations (nq,) at shares (F,) of its time, shape (F, nq)."""
-    mujoco, way = import_mujoco(), np.zeros(model.nv)
+    mujoco, way = mujoco_models.import_mujoco(), np.zeros(model.nv)
     mujoco.mj_differentiatePos(model, way, 1.0, start, end)
     found = np.tile(start, (len(share), 1))
     for qpos, along in zip(found, minimum_jerk(share), strict=True):
@@ -128,7 +126,7 @@ class Wanderer:
     """
 
     def __init__(self, model: mujoco.MjModel, where: str) -> None:
-        self.mujoco, self.model, self.where = import_mujoco(), model, where
+        self.mujoco, self.model, self.where = mujoco_models.import_mujoco(), model, where
         self.data = self.mujoco.MjData(model)
         rest = np.array(model.key_qpos[0] if model.nkey else model.qpos0)
         kinds = self.mujoco.mjtJoint
@@ -224,7 +222,7 @@ class Wanderer:
     def _inside(self, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pairs of geoms that penetrate each other, (C, 2), and the depths, (C,) [m]."""
         self.data.qpos[:] = qpos
-        with mujoco_warnings():
+        with mujoco_models.mujoco_warnings():
             self.mujoco.mj_fwdPosition(self.model, self.data)
         depth_m = -np.array(self.data.contact.dist[: self.data.ncon])
         deep = depth_m > DEPTH_M

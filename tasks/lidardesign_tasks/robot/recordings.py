@@ -10,14 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lidardesign.errors import DataError
-from lidardesign.numerics import unit_vectors
-from lidardesign.run.arrays import csv_rows, read_npz
-from lidardesign.run.inputs import TABLE
-from lidardesign.run.validation import suggest
-from lidardesign.run.yaml import plain_number
-from lidardesign.scenes.mujoco_models import import_mujoco
-from lidardesign.task import FolderConfig
+from lidardesign import DataError, FolderConfig, csv_rows, inputs, mujoco_models, plain_number, read_npz, suggest
 
 if TYPE_CHECKING:
     import mujoco
@@ -59,7 +52,7 @@ class Recording:
 
 def columns(model: mujoco.MjModel) -> list[str]:
     """Names of the entries of `qpos`: joint names, with .x to .z and .qw to .qz if free, and .qw to .qz for balls."""
-    kinds, names = import_mujoco().mjtJoint, []
+    kinds, names = mujoco_models.import_mujoco().mjtJoint, []
     for joint in range(model.njnt):
         name = model.joint(joint).name or f"joint{joint}"
         kind = int(model.jnt_type[joint])
@@ -70,7 +63,7 @@ def columns(model: mujoco.MjModel) -> list[str]:
 
 def turns(model: mujoco.MjModel) -> list[int]:
     """Indices in `qpos` at which quaternions of free joints and balls begin."""
-    kinds = import_mujoco().mjtJoint
+    kinds = mujoco_models.import_mujoco().mjtJoint
     shift = {int(kinds.mjJNT_FREE): 3, int(kinds.mjJNT_BALL): 0}
     pairs = zip(model.jnt_type.tolist(), model.jnt_qposadr.tolist(), strict=True)
     return [start + shift[kind] for kind, start in pairs if kind in shift]
@@ -158,7 +151,8 @@ def _continuous(quaternions: np.ndarray, name: str, path: Path) -> np.ndarray:
     largest = np.abs(quaternions).max(axis=1, keepdims=True)
     if not largest.all():
         raise DataError(f"a quaternion of {name.rpartition('.')[0]!r} is 0", where=str(path), allowed="other lengths")
-    unit = unit_vectors(quaternions / largest)  # of any length that a number has
+    scaled = quaternions / largest  # of any length that a number has
+    unit = scaled / np.linalg.norm(scaled, axis=1, keepdims=True)
     turned = np.einsum("ij,ij->i", unit[1:], unit[:-1]) < 0
     return unit * np.where(np.cumsum([False, *turned]) % 2, -1.0, 1.0)[:, None]
 
@@ -168,7 +162,7 @@ def _read(path: Path, changed_ns: int, size: int) -> Mapping[str, np.ndarray]:
     """Read the columns of a file by name, cached as space and both splits need it."""
     if path.suffix.lower() == ".npz":
         return read_npz(path)
-    (_, header), *rows = csv_rows(path, TABLE) or [(1, [])]
+    (_, header), *rows = csv_rows(path, inputs.TABLE) or [(1, [])]
     names = [name.strip() for name in header]
     if len(set(names)) < len(names):
         raise DataError("a column is given twice", where=str(path))

@@ -12,15 +12,22 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lidardesign.errors import BackgroundNote, ConfigError
-from lidardesign.numerics import SLACK
-from lidardesign.run.validation import suggest
-from lidardesign.scenes.casting import SceneCaster
-from lidardesign.scenes.mujoco_models import FileState, ModelGeom, body_poses, load_model, model_files, visible_geoms
-from lidardesign.scenes.scene import Body, Mesh, Plane, Scene, inverse_rigid
-from lidardesign.scenes.surface import half_extents_m, sample_body
-from lidardesign.space import DesignSpace
-from lidardesign.task import random_generator
+from lidardesign import (
+    BackgroundNote,
+    Body,
+    ConfigError,
+    DesignSpace,
+    Mesh,
+    Plane,
+    Scene,
+    SceneCaster,
+    half_extents_m,
+    inverse_rigid,
+    mujoco_models,
+    random_generator,
+    sample_body,
+    suggest,
+)
 from lidardesign_tasks.robot.recordings import listed
 
 if TYPE_CHECKING:
@@ -65,7 +72,7 @@ class Model:
     """
 
     model: mujoco.MjModel
-    pieces: tuple[ModelGeom, ...]
+    pieces: tuple[mujoco_models.ModelGeom, ...]
     targets: tuple[Target, ...]
     known: np.ndarray
     mount: int | None
@@ -73,11 +80,11 @@ class Model:
 
     def poses(self, qpos: np.ndarray) -> np.ndarray:
         """Poses of all bodies in the frame of the mount, or in the world, shape (F, nbody, 4, 4)."""
-        poses = body_poses(self.model, qpos)
+        poses = mujoco_models.body_poses(self.model, qpos)
         if self.mount is not None:
             poses = inverse_rigid(poses[:, self.mount])[:, None] @ poses
             poses[:, self.mount] = np.eye(4)
-        resting = np.abs(poses - poses[0]).max(axis=(0, 2, 3)) < SLACK
+        resting = np.isclose(poses, poses[0], rtol=0.0).all(axis=(0, 2, 3))
         poses[:, resting] = poses[0, resting]
         return poses
 
@@ -118,15 +125,15 @@ def read_model(path: Path, folder: Path | None, targets: Names, ignored: Names, 
         DataError: The file cannot be used.
         ConfigError: A name or pattern matches nothing visible; with the nearest name.
     """
-    return _read(path, folder, model_files(path, folder), targets, ignored, known, groups, mount)
+    return _read(path, folder, mujoco_models.model_files(path, folder), targets, ignored, known, groups, mount)
 
 
 @lru_cache(maxsize=4)
-def _read(path: Path, folder: Path | None, states: tuple[FileState, ...], targets: Names, ignored: Names,
+def _read(path: Path, folder: Path | None, states: tuple[mujoco_models.FileState, ...], targets: Names, ignored: Names,
           known: Names, groups: tuple[int, ...] | None, mount: str | None) -> Model:  # fmt: skip
     """Read a model; `states` of its files are part of the cache key, so that a changed model is read again."""
-    model, said = load_model(path, folder=folder)
-    pieces, notes = visible_geoms(model, groups=groups)
+    model, said = mujoco_models.load_model(path, folder=folder)
+    pieces, notes = mujoco_models.visible_geoms(model, groups=groups)
     missing = [note for note in (*said, *notes) if not isinstance(note, BackgroundNote)]
     gone = _named(pieces, ignored, "ignored", missing)
     pieces = tuple(without_notes(piece) for piece, left_out in zip(pieces, gone, strict=True) if not left_out)
@@ -151,7 +158,7 @@ def _read(path: Path, folder: Path | None, states: tuple[FileState, ...], target
     return Model(model, pieces, tuple(found), told_apart, number, (*said, *notes))
 
 
-def _named(pieces: Sequence[ModelGeom], patterns: Names, key: str, missing: Sequence[str]) -> np.ndarray:
+def _named(pieces: Sequence[mujoco_models.ModelGeom], patterns: Names, key: str, missing: Sequence[str]) -> np.ndarray:
     """Mask of pieces whose body or geom matches a pattern, shape (pieces,); `missing` tells what the model lacks."""
     found, names = np.zeros(len(pieces), dtype=bool), [(piece.body_name, piece.geom_name) for piece in pieces]
     for pattern in patterns:
@@ -167,7 +174,7 @@ def _named(pieces: Sequence[ModelGeom], patterns: Names, key: str, missing: Sequ
     return found
 
 
-def _target(pieces: Sequence[ModelGeom], chosen: np.ndarray) -> Target:
+def _target(pieces: Sequence[mujoco_models.ModelGeom], chosen: np.ndarray) -> Target:
     first = pieces[chosen[0]]
     if any(isinstance(pieces[piece].shape, Plane) for piece in chosen):
         raise ConfigError(f"{first.body_name!r} is an infinite plane", where="task.targets", hint="ignore it")
@@ -176,12 +183,12 @@ def _target(pieces: Sequence[ModelGeom], chosen: np.ndarray) -> Target:
     return Target(first.body_name, first.body, chosen, box_m, mean_depth_m(points))
 
 
-def without_notes(piece: ModelGeom) -> ModelGeom:
+def without_notes(piece: mujoco_models.ModelGeom) -> mujoco_models.ModelGeom:
     """The piece without the notes of its mesh."""
     return replace(piece, shape=replace(piece.shape, notes=())) if isinstance(piece.shape, Mesh) else piece
 
 
-def outline_m(piece: ModelGeom) -> np.ndarray:
+def outline_m(piece: mujoco_models.ModelGeom) -> np.ndarray:
     """Points on a piece's surface in its body's frame, shape (K, 3) [m]."""
     if isinstance(piece.shape, Mesh):
         points = piece.shape.vertices[np.unique(piece.shape.faces)]

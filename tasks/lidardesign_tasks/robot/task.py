@@ -15,16 +15,16 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import BeforeValidator, Field
 
-from lidardesign.errors import ConfigError
-from lidardesign.scenes.rays import Returns
-from lidardesign.scenes.scene import Scene
-from lidardesign.space import DesignSpace
-from lidardesign.task import (
+from lidardesign import (
+    ConfigError,
     Defaults,
+    DesignSpace,
     FolderConfig,
     Information,
     Interval,
     Metric,
+    Returns,
+    Scene,
     Score,
     Split,
     Vector,
@@ -181,9 +181,9 @@ class MujocoTask:
         """Score by the metric of the configuration; see `measures`."""
         return score(scene, returns)
 
-    def informs(self, scene: Scene, returns: Sequence[Returns]) -> Information:
+    def informs(self, scene: Scene, returns: Sequence[Returns], share: float) -> Information:
         """Information of returns by the metric of the configuration."""
-        return informs(scene, returns)
+        return informs(scene, returns, share)
 
     def features(self, scene: Scene, returns: Returns) -> np.ndarray:
         """The mean place of what is taken for a target, (3,) [m]; not a number where nothing is."""

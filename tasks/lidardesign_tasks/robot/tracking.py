@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lidardesign.scenes.rays import Returns
-from lidardesign.task import Information
+from lidardesign import Information, Returns
 
 # A ball hit evenly over its disc is hit, on average, this share of its radius in front of its centre's plane
 MEAN_DEPTH = 2 / 3
