@@ -209,10 +209,11 @@ def reconstruct_curve(points: np.ndarray) -> np.ndarray | None:
     if len(points) < 2:
         return None
     points = points[np.lexsort((points[:, 1], points[:, 0]))]
-    pieces = [points]
-    for start, end in itertools.pairwise(points):
-        length = float(np.linalg.norm(end - start))
-        if length <= LARGEST_GAP_M:
-            share = np.linspace(0.0, 1.0, math.ceil(length / TRUTH_STEP_M) + 1)[1:-1, None]
-            pieces.append(start + share * (end - start))
-    return np.concatenate(pieces)
+    along = np.diff(points, axis=0)
+    length = np.linalg.norm(along, axis=1)
+    steps = np.where(length <= LARGEST_GAP_M, np.ceil(length / TRUTH_STEP_M), 1.0).clip(min=1.0)
+    inner = steps.astype(int) - 1
+    line = np.repeat(np.arange(len(inner)), inner)
+    number = np.arange(1, len(line) + 1) - np.repeat(np.cumsum(inner) - inner, inner)
+    between = points[line] + (number * (1.0 / steps)[line])[:, None] * along[line]
+    return np.concatenate([points, between])
