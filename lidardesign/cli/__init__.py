@@ -1,1 +1,1 @@
-"""The command line: one thin file per subcommand."""
+"""The command line: one thin file per subcommand; options and their help are in `lidardesign.choices`."""

@@ -1,1 +1,4 @@
-"""Constraint files, the bounds that follow from them, and the independent checker."""
+"""Constraint files (`document`), what they allow at all, and the independent checker (`check`).
+
+Fits keep constraints by `lidardesign.mixture.bounds`.
+"""

@@ -1,6 +1,6 @@
 """Export formats: plugins of the entry-point group `lidardesign.formats`, and designs written in them.
 
-Formats of this package are beside the functions that write them.
+Formats of this package are beside the functions that write them, and listed in pyproject.toml as those of others are.
 """
 
 from __future__ import annotations

@@ -30,7 +30,7 @@ RELATIVE_FLOOR = 1e-4
 # interval's own arithmetic and writing; a micrometre per kilometre.
 INWARD = SLACK
 # Rolls beyond this would swap what is called horizontal and vertical.
-LARGEST_ROLL_RAD = math.pi / 4
+LARGEST_ROLL_RAD = math.radians(MOST_ROLL_DEG)
 
 Pins = tuple[float | None, ...]
 

@@ -1,7 +1,7 @@
 """Gates of candidate rays: a few for each, from what the ray or its sensor returns, inside constraints.
 
 Gates hold quantiles of the informative returns of a ray and of rays near it. Narrow gates cost fewer bits and lose
-returns outside; the choice decides between them.
+returns outside; `choice` decides between them, or `selection` where a sensor has one gate.
 """
 
 from __future__ import annotations
