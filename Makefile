@@ -1,5 +1,6 @@
 # make demo   sets everything up in .venv and runs the whole chain on the built-in face task, three to four minutes
 # make test   sets up, lints and runs the tests, a few minutes; installs nothing outside of .venv, 3.3 GB there with torch for the processor
+# make test-slow  runs what takes longer: pages of the docs and examples from beginning to end, packages, kills; as CI does
 # make docs   writes the documentation with a search as pages of build/site, which load nothing from elsewhere
 # make consumers  installs the programs that tests give exported files to, from the system's packages, as CI does
 # make test-arithmetic  runs the commands of the docs with the arithmetic of a plain processor, two minutes
@@ -27,7 +28,7 @@ JOBS ?= 2
 LONG := $(BIN)/python -m pytest -p tests.conftest -p benchmarks.soak.long_runs -m long -n $(JOBS) --maxschedchunk 1 \
 	--max-worker-restart 100 -o tmp_path_retention_policy=failed --page docs/soak
 
-.PHONY: demo test docs dist consumers setup system-programs test-arithmetic test-pythons coverage mutation lint fuzz soak soak-benchmarks soak-runs soak-seeds soak-kills soak-promise clean
+.PHONY: demo test test-slow docs dist consumers setup system-programs test-arithmetic test-pythons coverage mutation lint fuzz soak soak-benchmarks soak-runs soak-seeds soak-kills soak-promise clean
 
 # setuptools announces every editable install with a warning
 INSTALL := PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable
@@ -72,9 +73,15 @@ consumers: system-programs
 # All that the tests need
 setup: $(BIN)/.test $(if $(filter true,$(CI)),system-programs)
 
+PYTEST := $(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
+
 test: setup
 	$(BIN)/python -m ruff check --no-cache .
-	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
+	$(PYTEST) -m 'not slow and not long'
+
+# Whole pages of the docs, examples, packages in environments of their own, kills: CI runs them too
+test-slow: setup
+	$(PYTEST) -m 'slow and not long'
 
 # Every kind of processor rounds in its own way, and a small run ends elsewhere on each: this is another one
 test-arithmetic: $(BIN)/.test

@@ -304,7 +304,7 @@ class Scores:
         """
         run, request = self.run, self.evaluation_request
         # the density is that of the run's own scenes, whatever it is judged by
-        if (request.config, request.seed) != (run.config.task, run.config.seed):
+        if not request.train or (request.config, request.seed) != (run.config.task, run.config.seed):
             request = replace(request, train=run.scenes("train", run.config.seed))
         with phase("accuracy"):
             from lidardesign.evaluation.accuracy.evaluation import measure_accuracy

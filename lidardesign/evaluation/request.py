@@ -19,7 +19,7 @@ from lidardesign.problem.world import World
 from lidardesign.rays.training_scenes import TrainingScenes
 from lidardesign.samples import Samples
 from lidardesign.scenes.scene import Scene
-from lidardesign.scoring.scene_scores import TrainingScorer
+from lidardesign.scoring.scene_scores import Preparation, TrainingScorer
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.simulate.plan import Planner
@@ -94,6 +94,11 @@ class EvaluationRequest:
         """The training scenes that baselines are made from."""
         return World(self.task, self.config, self.space, self.seed, self.train, self.training, self.planner)
 
+    @cached_property
+    def preparation(self) -> Preparation:
+        """What the task prepares for the rays of rows."""
+        return self.world.new_preparation()
+
     @property
     def metric(self) -> Metric:
         """The meaning of scores."""
@@ -139,9 +144,7 @@ class EvaluationRequest:
 
     def scorer(self, scenes: Iterable[Scene]) -> TrainingScorer:
         """A scorer of training scenes, under the effects of the evaluation."""
-        return TrainingScorer(
-            self.task, self.metric, self.seed, scenes, self.planner, preparation=self.world.preparation
-        )
+        return TrainingScorer(self.task, self.metric, self.seed, scenes, self.planner, preparation=self.preparation)
 
 
 def check_baseline(name: str, *, where: str = "baselines") -> None:

@@ -204,7 +204,8 @@ def _score_all(
 ) -> _Scored:
     """Score all entries in all scenes, here or by workers; `known` plans are not made again."""
     jobs = {entry.key: entry for entry in entries}
-    world = request.world if planner is request.planner else replace(request.world, planner=planner)
+    is_own = planner is request.planner
+    preparation = request.preparation if is_own else replace(request.world, planner=planner).new_preparation()
     # for misplaced rays as for those in their place
     lists = [assign_devices(entry.positions, entry.devices) for entry in jobs.values()]
     scenes = score_scenes(
@@ -217,7 +218,7 @@ def _score_all(
         known,
         progress,
         request.starmap,
-        world.preparation.of(lists, starmap=request.starmap),
+        preparation.of(lists, starmap=request.starmap),
     )
     of_entries = zip(*(scene.scores for scene in scenes), strict=True)
     return _Scored(

@@ -24,7 +24,7 @@ from lidardesign.rays.training_scenes import HELD_BACK, TrainingScenes
 from lidardesign.run.yaml import merged
 from lidardesign.scenes.scene import group_numbers
 from lidardesign.scoring.fired import Positions, fired, without_each
-from lidardesign.scoring.scene_scores import PREPARE, Preparation, TrainingScorer
+from lidardesign.scoring.scene_scores import Preparation, TrainingScorer
 from lidardesign.sensors.adaptive import mean_mbps
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design import DesignSpec
@@ -81,7 +81,7 @@ def held_back_scorer(training: TrainingScenes, planner: Planner | None = None) -
         scenes,
         planner,
         plans_once=True,
-        preparation=Preparation(run.task, training.seed, training.scenes(PREPARE), planner),
+        preparation=Preparation.of_run(training, planner),
     )
 
 

@@ -77,9 +77,13 @@ class World:
         for key in [one for one in self._known if not (isinstance(one, tuple) and one[0] in but)]:
             del self._known[key]
 
-    @cached_property
+    @property
     def preparation(self) -> Preparation:
-        """What the task prepares for sets of rays, on scenes that nothing else is made or tried on."""
+        """What the task prepares for the sets of rays that methods try, on scenes of their own."""
+        return self.known(PREPARE, self.new_preparation)
+
+    def new_preparation(self) -> Preparation:
+        """What the task prepares for other sets of rays, which say together what effects training scenes call for."""
         return Preparation(self.task, self.seed, self.scenes(PREPARE), self.planner)
 
     def scorer(self, *, keeps_casters: bool = False) -> TrainingScorer:

@@ -185,11 +185,7 @@ def _sections(report: Report) -> list[tuple[str, str, str]]:
         ("constraints", "Constraints and how tight each is", constraints_section(report.constraints)),
         ("physics", "Physics", effects_section(evaluation) if evaluation.effects else ""),
         ("audit", "Audit of the physics", audit_section(evaluation)),
-        (
-            "accuracy",
-            "What accuracy costs",
-            accuracy_section(sweeps),
-        ),
+        ("accuracy", "What accuracy costs", accuracy_section(sweeps)),
         ("time", "Where the time went", times_section(report.times)),
         ("reproduce", "How to reproduce this", rendered("report/templates/reproduce.html", how=report.reproduce)),
     ]

@@ -39,7 +39,7 @@ def _environment() -> Environment:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    environment.filters |= {"counted": counted, "digits": four_digits, "fixed": fixed, "plain": plain_number}
+    environment.filters |= {"counted": counted, "digits": four_digits, "fixed": fixed, "plain": readable_number}
     environment.filters["formatted"] = format
     environment.policies["json.dumps_kwargs"] = {"allow_nan": False}
     return environment
@@ -61,7 +61,7 @@ def fixed(value: float, decimals: int) -> str:
     return f"{round(float(value), decimals) + 0.0:.{decimals}f}"
 
 
-def plain_number(value: float, digits: int, tiny: float = TINY) -> str:
+def readable_number(value: float, digits: int, tiny: float = TINY) -> str:
     """A number of at least 0 without an exponent; below `tiny` as `<tiny`."""
     if 0 < value < tiny:
         return f"<{tiny:g}"

@@ -23,6 +23,7 @@ import numpy as np
 from lidardesign.errors import PluginError
 from lidardesign.plugins import plugin_guard, plugin_method
 from lidardesign.rays.information import FEW_SCENES
+from lidardesign.rays.training_scenes import TrainingScenes
 from lidardesign.run.clock import Progress, phase
 from lidardesign.run.content import fingerprint
 from lidardesign.scenes.casting import SceneCaster
@@ -34,7 +35,7 @@ from lidardesign.sensors.adaptive import AdaptiveRays, returns_of
 from lidardesign.simulate.detector.physics import Physics
 from lidardesign.simulate.plan import EffectPlan, Planner
 from lidardesign.simulate.returns import build_casters, simulate_many
-from lidardesign.task import Metric, Score, Task, prepares
+from lidardesign.task import Metric, Score, Task, prepares, random_generator
 from lidardesign.workers import Starmap
 
 # Rays times frames that are traced together: their returns take 24 bytes each.
@@ -327,6 +328,11 @@ class Preparation:
         self._plans: list[EffectPlan | None] = []
         self._known: dict[str, Any] = {}
 
+    @classmethod
+    def of_run(cls, training: TrainingScenes, planner: Planner | None) -> Preparation:
+        """What the task of a run prepares, on scenes that nothing else is made or tried on."""
+        return cls(training.run.task, training.seed, training.scenes(PREPARE), planner)
+
     @cached_property
     def scenes(self) -> tuple[Scene, ...]:
         """The scenes that the task gets."""
@@ -372,8 +378,10 @@ def prepare_for(
 ) -> Any:
     """What a task prepares for one set of rays, with the plan of each scene; the rest as of `Preparation`."""
     returns = []
-    for scene, plan in zip(scenes, plans, strict=True):
-        physics = planner.physics(plan, seed) if planner and plan else None
+    for number, (scene, plan) in enumerate(zip(scenes, plans, strict=True)):
+        # names of scenes may repeat, also those of held-out ones, and noise follows them
+        noise = int(random_generator(seed, PREPARE, number).integers(2**63))
+        physics = planner.physics(plan, noise) if planner and plan else None
         returns.append(returns_in_scene(scene, positions, build_casters(scene), physics))
     return _checked_preparation(task, scenes, returns, seed)
 

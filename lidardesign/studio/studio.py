@@ -30,7 +30,7 @@ from lidardesign.run_folder import ignore
 from lidardesign.samples import load_samples
 from lidardesign.scenes.scene import Scene, group_numbers
 from lidardesign.scoring.fired import fired
-from lidardesign.scoring.scene_scores import PREPARE, Preparation, TrainingScorer
+from lidardesign.scoring.scene_scores import Preparation, TrainingScorer
 from lidardesign.sensors.adaptive import mean_mbps
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.space import observed_point
@@ -361,7 +361,7 @@ class Studio:
             training.seed,
             training.scenes(PURPOSE),
             planner,
-            preparation=Preparation(run.task, training.seed, training.scenes(PREPARE), planner),
+            preparation=Preparation.of_run(training, planner),
         )
 
     def _scores_of(self, design: Design, detector: str, settings: tuple[str, ...]) -> np.ndarray:

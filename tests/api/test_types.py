@@ -62,11 +62,13 @@ def checked(tmp_path_factory):
     return said, lines
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("file", ["script.py", "task"])
 def test_a_users_script_and_a_new_task_have_no_errors_of_types(checked, file):
     assert checked[0].get(file, []) == []
 
 
+@pytest.mark.slow
 def test_every_name_of_the_package_is_known_and_every_mistake_is_found(checked):
     said, lines = checked
     found = [(lines[number - 1], text) for number, text in said["names.py"]]

@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from lidardesign.cli.terminal.grids import duration, print_table
-from lidardesign.run.markup import plain_number
+from lidardesign.run.markup import readable_number
 
 HEADINGS = ("design", "rays", "difference (95 % interval)", "seconds")
 LINES = (["free", "196", "-0.013 (-0.021 to -0.004)", "1.4, 2.6"], ["(own)", "36", "0.002 (-0.010 to 0.012)", "3, 3"])
@@ -54,4 +54,4 @@ def test_sentences_wrap_instead():
      (1.7e-7, 2, "<0.0001"), (1.0, 2, "1"), (1.5, 2, "1.5")],
 )  # fmt: skip
 def test_figures_have_no_exponents(value, digits, shown):
-    assert plain_number(value, digits) == shown
+    assert readable_number(value, digits) == shown

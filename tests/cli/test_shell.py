@@ -154,6 +154,7 @@ def gate(fitted, tmp_path):
     return run
 
 
+@pytest.mark.slow
 def test_the_workflow_passes_with_a_good_design_and_keeps_what_can_be_looked_at(gate, tmp_path):
     workflow = yaml.load((CI / "lidar-design.yml").read_text(), Loader=yaml.BaseLoader)
     (job,) = workflow["jobs"].values()
@@ -169,6 +170,7 @@ def test_the_workflow_passes_with_a_good_design_and_keeps_what_can_be_looked_at(
     assert json.loads((tmp_path / kept / "result.json").read_text())["rows"]
 
 
+@pytest.mark.slow
 def test_the_shell_script_fails_with_a_bad_design_and_says_why(gate, tmp_path):
     done = gate("sh design_gate.sh runs/gate 1e-6 runs/gate/designs/fit.yaml", RAYS="9")
     assert done.returncode == 1

@@ -88,6 +88,7 @@ def scheduler(tmp_path):
         started.close()
 
 
+@pytest.mark.slow
 def test_a_cluster_scores_as_this_process_does_though_a_worker_is_lost(scheduler):
     request = make_request()
     expected = results(evaluate(request))
@@ -99,6 +100,7 @@ def test_a_cluster_scores_as_this_process_does_though_a_worker_is_lost(scheduler
         assert results(evaluate(replace(request, starmap=starmap))) == expected
 
 
+@pytest.mark.slow
 def test_a_scheduler_that_is_lost_ends_the_evaluation_with_its_address(scheduler):
     request = make_request()
     scheduler.add_worker()
@@ -148,6 +150,7 @@ def test_without_dask_the_message_says_what_to_install(monkeypatch):
         score_by("tcp://127.0.0.1:1")
 
 
+@pytest.mark.slow
 def test_a_cluster_that_lost_its_last_worker_is_given_up(scheduler, monkeypatch):
     request = make_request()
     only = scheduler.add_worker()

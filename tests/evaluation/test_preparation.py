@@ -82,11 +82,16 @@ def request_of(task, **changes):
 def score_by_hand(task, request, scene, positions, physics, nominal=None):
     """The score of rays in a scene, by what is prepared for them, or for others."""
 
-    def seen(here, lists):
-        return [frame for rays in lists for frame in simulate(here, rays, physics=physics)]
+    def seen(here, lists, noise):
+        return [frame for rays in lists for frame in simulate(here, rays, physics=noise)]
 
-    learned = task.prepare(request.train, [seen(one, nominal or positions) for one in request.train], SEED)
-    return task.score(scene, seen(scene, positions), learned).value
+    returns = [seen(one, nominal or positions, noise_of(number, physics)) for number, one in enumerate(request.train)]
+    return task.score(scene, seen(scene, positions, physics), task.prepare(request.train, returns, SEED)).value
+
+
+def noise_of(number, physics):
+    """Effects with the noise that a training scene has to itself, whatever it is called."""
+    return physics and replace(physics, seed=int(random_generator(SEED, "prepare", number).integers(2**63)))
 
 
 @pytest.mark.parametrize("effects", [frozenset(), frozenset({"jitter"})], ids=["geometry", "jitter"])
@@ -121,6 +126,13 @@ def test_misplaced_rays_are_scored_by_what_was_prepared_for_their_place():
         misplaced = error.misplaced(entry.positions, SEED, number)
         expected = score_by_hand(by_hand, request, scene, misplaced, None, entry.positions)
         assert row.per_scene[number] == pytest.approx(expected)
+
+
+def test_scenes_of_one_name_have_noise_of_their_own():
+    task, scenes = DistanceTask(), [replace(one, name="scene") for one in [scenes_of("train")[0]] * 2]
+    Preparation(task, SEED, scenes, Planner(NOISY, frozenset({"jitter"}))).of(LISTS[:1])
+    ((_, (one, other)),) = task.learned_from
+    assert np.any(one[0].range_m != other[0].range_m)
 
 
 def test_baselines_that_are_drawn_anew_in_every_scene_fire_one_draw_and_say_so():

@@ -136,7 +136,7 @@ def test_accuracy_of_a_damaged_run_is_refused_before_anything_is_evaluated(fitte
     assert "missing" in lidardesign("evaluate", "run", "--accuracy", "--json").json["error"]["message"]
 
 
-@pytest.mark.parametrize("judged", [("--seed", "7"), ("--set", "train=2")])
+@pytest.mark.parametrize("judged", [("--seed", "7"), ("--set", "train=2"), ("--baseline", "none")])
 def test_sweeps_are_those_of_the_scenes_that_were_learned_whatever_designs_are_judged_by(
     fitted, lidardesign, judged, monkeypatch
 ):

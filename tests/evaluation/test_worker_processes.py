@@ -150,7 +150,6 @@ USING_WORKERS = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 @pytest.mark.parametrize("command", USING_WORKERS)
 def test_a_command_ends_when_a_worker_is_killed(run, command):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from lidardesign.cli.terminal.grids import RichConsole, difference_cell, duration, number, print_table, value_cells
 from lidardesign.run.clock import INSIDE, OTHER
-from lidardesign.run.markup import plain_number
+from lidardesign.run.markup import readable_number
 
 if TYPE_CHECKING:
     from lidardesign.evaluation.results import Evaluation
@@ -204,8 +204,8 @@ def _show_effects(document: Entry, rich: RichConsole) -> None:
     title = f"effects with the detector {detector}; those that are skipped may change {allowed} together"
     lines = []
     for effect in effects:
-        bounds = [plain_number(MILLIMETRES * effect["bound"], 3), plain_number(effect["lost"], 2)]
-        cost = plain_number(effect["seconds"], 2, tiny=SHORT_S)
+        bounds = [readable_number(MILLIMETRES * effect["bound"], 3), readable_number(effect["lost"], 2)]
+        cost = readable_number(effect["seconds"], 2, tiny=SHORT_S)
         on = "no" if effect["missing"] is None else "missing"
         if effect["on"]:
             on = "yes" if effect["scenes_on"] == 1 else f"in {100 * effect['scenes_on']:.0f} %"

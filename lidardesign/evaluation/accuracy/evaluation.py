@@ -124,7 +124,7 @@ class Bench:
             [self.positions],
             casters,
             physics,
-            self.request.world.preparation.of([self.positions]),
+            self.request.preparation.of([self.positions]),
         )
         return score.value
 
