@@ -111,7 +111,8 @@ def _add(request: EvaluationRequest, found: Rivals, asked: Asked) -> None:
     problem = replace(asked.problem, config=request.settings.get(method.name))
     refusal = refusal_of(method, problem)
     if refusal is not None:
-        at = " at equal bandwidth" if matched and any(entry.name == method.name for entry in found.entries) else ""
+        stands = matched and any((one.name, one.rays) == (method.name, matched.rays) for one in found.entries)
+        at = " at equal bandwidth" if stands else ""
         found.note(f"{method.name} is left out{at}: {refusal}" if refusal else "")
         return
     rays_of: Callable[[DesignSpec], Positions] = partial(fired, conditions=request.conditions, planner=request.planner)
