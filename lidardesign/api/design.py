@@ -27,7 +27,7 @@ from lidardesign.formats.designs import need_run, relative_folder
 from lidardesign.rays.information import FEW_SCENES
 from lidardesign.run.clock import WAIT_S, Progress, phase
 from lidardesign.run.manifest import locked_run, write_recorded
-from lidardesign.run.markup import rendered
+from lidardesign.run.markup import counted, rendered
 from lidardesign.run_folder import Notes, RunFolder, ignore, log_note, settings_texts
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Scene
@@ -257,8 +257,7 @@ class Design(DesignSource):
     def __repr__(self) -> str:
         spec = self.specification
         rays = "rays left open" if spec.count is None else f"{spec.count} rays"
-        sensors = "1 sensor" if len(spec.sensors) == 1 else f"{len(spec.sensors)} sensors"
-        return f"<Design {self.name}: {sensors}, layout {spec.layout}, {rays}>"
+        return f"<Design {self.name}: {counted(len(spec.sensors), 'sensor')}, layout {spec.layout}, {rays}>"
 
     def _repr_html_(self) -> str:
         spec = self.specification

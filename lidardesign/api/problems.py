@@ -55,11 +55,10 @@ class MethodRequest:
             ConfigError: The method is unknown, needs a design, or keeps not to a choice.
         """
         choices = fit_choices({**given, "method": None})
-        flags = flags_of(DesignChoices)
         check_choice(str(given["method"]), "--method", [*LAYOUTS, *METHODS.names()])
         method = METHODS.load(str(given["method"]))
         where = f"--method {method.name}"
-        for key, flag in flags.items():
+        for key, flag in flags_of(DesignChoices).items():
             value = choices[key]  # type: ignore[literal-required]
             if key not in KEPT and value and value != flag.default:
                 hint = f"leave it out: lidardesign fit RUN --method {method.name}"
@@ -71,10 +70,9 @@ class MethodRequest:
             raise ConfigError(f"it {fault}", where=where, hint=f"lidardesign evaluate RUN --baseline {method.name}")
         numbers = sorted(run.task.defaults.rays)
         seed = run.config.seed if choices["seed"] is None else choices["seed"]
-        config, training = run.config, TrainingScenes(run, seed)
-        learned = run.scenes("train", seed)
+        learned, training = run.scenes("train", seed), TrainingScenes(run, seed)
         problem = Problem(
-            World(run.task, config.task, config.space, seed, learned, training, Planner()),
+            World(run.task, run.config.task, run.config.space, seed, learned, training, Planner()),
             rays=numbers[len(numbers) // 2] if choices["rays"] is None else choices["rays"],
             gates=choices["gates"] or "sensor",
         )
@@ -98,7 +96,10 @@ class MethodRequest:
         if self.problem.gates == "ray" and not result.design.has_gates_per_ray:
             self.notes(f"the method {self.method.name} gives all rays of a sensor one gate, whatever --gates says")
         run, world = self.run, self.problem.world
-        origin: Mapping[str, Any] = {
+        with plugin_guard(run.task.name):
+            mount = mount_of(run.task, run.config.task)
+        provenance: Mapping[str, Any] = {
+            **result.design.provenance,
             "command": self.command,
             "method": self.method.name,
             "task": run.task.name,
@@ -106,9 +107,6 @@ class MethodRequest:
             "seed": world.seed,
             "versions": versions(),
         }
-        with plugin_guard(run.task.name):
-            mount = mount_of(run.task, run.config.task)
-        provenance = {**result.design.provenance, **origin}
         return replace(result.design, name=self.name, mount=mount, provenance=provenance)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
@@ -291,13 +292,7 @@ def learn(
         ThresholdError: The tolerance was not reached; the run is finished and can be opened.
     """
     request = LearnRequest.resolve(task, choices, notes)
-    said: list[str] = []
-
-    def remark(note: str) -> None:
-        if note not in said:
-            said.append(note)
-            notes(note)
-
+    remark = cache(notes)  # every note once
     for note in request.task_notes():
         remark(note)
     result = request.run(progress and (lambda now: progress("learning", now.step, now.steps)), remark)

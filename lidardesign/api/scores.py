@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -200,16 +200,32 @@ class ScoreRequest:
         Arguments:
             searching: Called with how the searches of the baseline cma stand.
         """
-        request = evaluation_request(
-            self.run, self.designs, self.rays, self.baselines, self.seed, self.choices["scenes_seed"], self.learned
-        )
-        misplaced = misplacement(self.choices)
-        return replace(
-            request,
+        run, learned, seed, scenes_seed = self.run, self.learned, self.seed, self.choices["scenes_seed"]
+        from_runs = [design.specification for design in self.designs if design.run is not None]
+        return EvaluationRequest(
+            task=run.task,
+            config=run.config.task,
+            space=run.config.space,
+            seed=seed,
+            designs=[design.specification for design in self.designs],
+            rays=self.rays,
+            baselines=self.baselines,
+            train=run.scenes("train", seed) if self.baselines else (),  # for baselines alone
+            test=run.scenes("test", seed if scenes_seed is None else scenes_seed),
+            scenes_seed=scenes_seed,
+            without_visibility=None
+            if not from_runs
+            else partial(twin_without_visibility, from_runs[0], learned, samples=cache(partial(twin_samples, learned))),
+            density=cache(
+                lambda: (
+                    load_samples(learned.folder, learned.config.space) if (learned.folder / SAMPLES).exists() else None
+                )
+            ),
+            training=TrainingScenes(run, seed),
             planner=self.planner,
             audit=self.audit,
             settings={CMA: CmaSettings(self.cma_seconds, show=searching)},
-            mount_error=misplaced,
+            mount_error=misplacement(self.choices),
             losses=self.choices["losses"],
             alone=self.alone,
             named=tuple(self.choices["baselines"]),
@@ -385,47 +401,3 @@ def _check_baseline(name: str | None, designs: Sequence[str]) -> None:
         raise ConfigError(f"no baseline or design {name!r}", where=where, allowed=allowed)
     if len(designs) == 1:
         raise ConfigError(f"there is no other design to compare {name} with", where=where, hint="name a baseline")
-
-
-def evaluation_request(
-    run: RunFolder,
-    designs: Sequence[Design],
-    rays: Iterable[int],
-    baselines: Sequence[str],
-    seed: int | None = None,
-    scenes_seed: int | None = None,
-    learned: RunFolder | None = None,
-) -> EvaluationRequest:
-    """The request that scores designs in a run's scenes.
-
-    Arguments:
-        run: Whose task and configuration judge.
-        designs: The designs.
-        rays: Numbers of rays.
-        baselines: By name.
-        seed: Root of the random streams; None: the run's.
-        scenes_seed: Root of the held-out scenes; None: `seed`.
-        learned: The run as it was learned, where `run` judges by other settings.
-    """
-    config, learned = run.config, learned or run
-    seed = config.seed if seed is None else seed
-    from_runs = [design.specification for design in designs if design.run is not None]
-    return EvaluationRequest(
-        task=run.task,
-        config=config.task,
-        space=config.space,
-        seed=seed,
-        designs=[design.specification for design in designs],
-        rays=sorted(set(rays)),
-        baselines=tuple(dict.fromkeys(baselines)),
-        train=run.scenes("train", seed) if baselines else (),  # for baselines alone
-        test=run.scenes("test", seed if scenes_seed is None else scenes_seed),
-        scenes_seed=scenes_seed,
-        without_visibility=None
-        if not from_runs
-        else partial(twin_without_visibility, from_runs[0], learned, samples=cache(partial(twin_samples, learned))),
-        density=cache(
-            lambda: load_samples(learned.folder, learned.config.space) if (learned.folder / SAMPLES).exists() else None
-        ),
-        training=TrainingScenes(run, seed),
-    )

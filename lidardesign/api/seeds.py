@@ -6,12 +6,12 @@ from learning to the score.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import reduce
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import TYPE_CHECKING, Unpack
 
 from lidardesign.api.design import Design
 from lidardesign.api.scores import ScoreRequest, Scores, score_choices
@@ -23,6 +23,7 @@ from lidardesign.evaluation.score import progress_of_part
 from lidardesign.evaluation.seeds import over_seeds
 from lidardesign.formats.designs import read_design
 from lidardesign.run.clock import Progress, outermost_clock, running
+from lidardesign.run.yaml import leaves
 from lidardesign.run_folder import Notes, RunFolder, log_note
 
 if TYPE_CHECKING:
@@ -137,14 +138,10 @@ class SeedsRequest:
                 for number, request in enumerate(self.requests)
             ]
             seeds = [request.seed for request in self.requests]
-            joint = over_seeds([each.evaluation for each in scores], seeds, self._scenes_seed)
+            scenes_seed = self.requests[0].choices["scenes_seed"]  # the same for all
+            joint = over_seeds([each.evaluation for each in scores], seeds, scenes_seed)
             timings = clock.timings()
         return replace(scores[0], evaluation=joint, timings=timings)
-
-    @property
-    def _scenes_seed(self) -> int:
-        request = self.requests[0]
-        return request.seed if request.choices["scenes_seed"] is None else request.choices["scenes_seed"]
 
 
 def _check_runs(runs: Sequence[RunFolder]) -> None:
@@ -172,16 +169,9 @@ def _check_runs(runs: Sequence[RunFolder]) -> None:
 
 def _other_setting(first: RunFolder, second: RunFolder) -> str | None:
     """The first configuration key other than the seed in which two runs differ; None without one."""
-    ours, theirs = (_flat(run.config.as_document()) for run in (first, second))
-    differing = (key for key in [*ours, *theirs] if key != SEED and ours.get(key) != theirs.get(key))
-    return next(differing, None)
-
-
-def _flat(document: Mapping[str, Any], front: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in document.items():
-        flat |= _flat(value, f"{front}{key}.") if isinstance(value, Mapping) else {f"{front}{key}": value}
-    return flat
+    ours, theirs = (dict(leaves(run.config.as_document())) for run in (first, second))
+    differing = (key for key in [*ours, *theirs] if key != (SEED,) and ours.get(key) != theirs.get(key))
+    return next((".".join(part for part in key if isinstance(part, str)) for key in differing), None)
 
 
 def _check_choices(choices: NamedChoices) -> None:

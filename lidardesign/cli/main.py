@@ -146,26 +146,21 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # panels take half as long again, and fold at 80 columns
 )
-app.add_typer(tasks_app, name="tasks", context_settings=SETTINGS)
-app.add_typer(formats_app, name="formats", context_settings=SETTINGS)
-app.add_typer(methods_app, name="methods", context_settings=SETTINGS)
-app.add_typer(catalog_app, name="catalog", context_settings=SETTINGS)
-app.add_typer(config_app, name="config", context_settings=SETTINGS)
 for subcommand in (learn, fit, constrain, evaluate, studio, simulate, export, capture, show):
     app.command()(subcommand)
 groups = {
-    "": app,
-    "tasks ": tasks_app,
-    "formats ": formats_app,
-    "methods ": methods_app,
-    "catalog ": catalog_app,
-    "config ": config_app,
+    "tasks": tasks_app,
+    "formats": formats_app,
+    "methods": methods_app,
+    "catalog": catalog_app,
+    "config": config_app,
 }
-for prefix, group in groups.items():
+for name, group in {"": app, **groups}.items():
+    if name:
+        app.add_typer(group, name=name, context_settings=SETTINGS)
     for registered in group.registered_commands:
-        name = registered.name or registered.callback.__name__
         registered.cls, registered.context_settings = StrictCommand, SETTINGS
-        registered.epilog = epilog_of(f"{prefix}{name}")
+        registered.epilog = epilog_of(f"{name} {registered.name or registered.callback.__name__}".strip())
 
 
 def _print_version(wanted: bool) -> None:

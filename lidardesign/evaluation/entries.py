@@ -131,8 +131,7 @@ def strongest_baseline(request: EvaluationRequest, entries: Sequence[Entry], ray
     scorer = request.scorer(held_back)
     numbers = range(len(scorer.scenes(count)))
     scores = [scorer.scores_in(number, [entry.lit_in(number) for entry in baselines]) for number in numbers]
-    means = np.mean(scores, axis=0).tolist()
-    values = dict(zip((entry.name for entry in baselines), means, strict=True))
+    values = dict(zip((entry.name for entry in baselines), np.mean(scores, axis=0).tolist(), strict=True))
     return StrongestBaseline.best_of(values, request.metric.better, rays, len(numbers))
 
 

@@ -179,8 +179,7 @@ def usual_numbers(designs: Iterable[DesignSpec], budgets: Iterable[int]) -> list
     """The default numbers of rays: the task's, those of fixed patterns and budgets, and of chosen rays."""
     designs = list(designs)
     sizes = {design.count for design in designs if design.count is not None}
-    chosen = (design.counts or () for design in designs)
-    return fired_numbers(designs, sorted(sizes.union(budgets, *chosen)))
+    return fired_numbers(designs, sorted(sizes.union(budgets, *(design.counts or () for design in designs))))
 
 
 def fired_numbers(designs: Sequence[DesignSpec], counts: Iterable[int]) -> list[int]:

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from lidardesign.estimates import HALF_INTERVAL, Estimate, Interval, as_documents, paired_difference
+from lidardesign.estimates import HALF_INTERVAL, Estimate, Interval, as_documents
 from lidardesign.evaluation.entries import EffectSummary, StrongestBaseline
 from lidardesign.evaluation.mounting import MountError
 from lidardesign.evaluation.sweep import Accuracy
@@ -405,14 +405,6 @@ class Audit:
             "seconds_everything": everything,
             "rows": [row.as_dict() for row in self.rows],
         }
-
-
-def audit_rows(planned: Sequence[Row], everything: Sequence[Row], metric: Metric) -> list[AuditRow]:
-    """The same rows under both, paired."""
-    return [
-        AuditRow(row, other, *paired_difference(row.per_scene, other.per_scene, row.groups, limits=metric.limits))
-        for row, other in zip(planned, everything, strict=True)
-    ]
 
 
 def csv_text(evaluation: Evaluation) -> str:

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 
@@ -48,14 +47,6 @@ class Rivals:
         self.notes += [line] if line and line not in self.notes else []
 
 
-class Asked(NamedTuple):
-    """A method and its problem, and the entry whose bandwidth it is given; None at equal rays."""
-
-    method: Method
-    problem: Problem
-    matched: Entry | None
-
-
 @phase("rays")
 def rivals_of(request: EvaluationRequest, designs: Sequence[Entry], counts: Sequence[int]) -> Rivals:
     """What the methods of a request make at numbers of rays, then in the bandwidth of each design at one of them.
@@ -75,16 +66,12 @@ def rivals_of(request: EvaluationRequest, designs: Sequence[Entry], counts: Sequ
         gates="ray" if any(design.has_gates_per_ray for design in request.designs) else "sensor",
         compared=_comparison(request, designs, counts),
     )
-    asked = [Asked(method, replace(problem, rays=count), None) for method in methods for count in counts]
-    if request.equal_bandwidth:
-        asked += [
-            Asked(method, replace(problem, limit_mbps=entry.mbps(request.bandwidth)), entry)
-            for entry in designs
-            if entry.rays in counts
-            for method in methods
-        ]
-    for one in asked:
-        _add(request, found, one)
+    for method in methods:
+        for count in counts:
+            _add(request, found, method, replace(problem, rays=count))
+    for entry in designs if request.equal_bandwidth else ():
+        for method in methods if entry.rays in counts else ():
+            _add(request, found, method, replace(problem, limit_mbps=entry.mbps(request.bandwidth)), entry)
     problem.world.forget(but=[method.name for method in methods if method.is_redrawn])
     return found
 
@@ -105,10 +92,11 @@ def _comparison(request: EvaluationRequest, designs: Sequence[Entry], counts: Se
     )
 
 
-def _add(request: EvaluationRequest, found: Rivals, asked: Asked) -> None:
-    """Add the entry of a method for a problem, or why there is none."""
-    method, matched = asked.method, asked.matched
-    problem = replace(asked.problem, config=request.settings.get(method.name))
+def _add(
+    request: EvaluationRequest, found: Rivals, method: Method, problem: Problem, matched: Entry | None = None
+) -> None:
+    """Add the entry of a method for a problem, in the bandwidth of an entry where that is given; or why not."""
+    problem = replace(problem, config=request.settings.get(method.name))
     refusal = refusal_of(method, problem)
     if refusal is not None:
         stands = matched and any((one.name, one.rays) == (method.name, matched.rays) for one in found.entries)
@@ -125,8 +113,7 @@ def _add(request: EvaluationRequest, found: Rivals, asked: Asked) -> None:
         for note in result.notes:
             found.note(note)
         design = result.design
-        count = design.count if problem.rays is None else problem.rays
-        positions = rays_of(design, count)
+        positions = rays_of(design, design.count if problem.rays is None else problem.rays)
         search = design.provenance.get("search") if matched is None else None
     except InfeasibleError as error:
         if matched is None or error.message != NOTHING_FITS:
@@ -153,5 +140,4 @@ def _add(request: EvaluationRequest, found: Rivals, asked: Asked) -> None:
 def _redrawn(
     method: Method, problem: Problem, rays_of: Callable[[DesignSpec, int], Positions], scene: int
 ) -> Positions:
-    result = design_by(method, replace(problem, draw=scene))
-    return rays_of(result.design, problem.rays)
+    return rays_of(design_by(method, replace(problem, draw=scene)).design, problem.rays)

@@ -29,7 +29,7 @@ from lidardesign.estimates import (
 from lidardesign.evaluation.entries import Entry, design_entries, effect_notes, effect_summaries, strongest_baseline
 from lidardesign.evaluation.mounting import MountError
 from lidardesign.evaluation.request import EvaluationRequest, fired_numbers, missing_row_notes
-from lidardesign.evaluation.results import Audit, Evaluation, Mounting, Paired, Row, audit_rows, middle_rays
+from lidardesign.evaluation.results import Audit, AuditRow, Evaluation, Mounting, Paired, Row, middle_rays
 from lidardesign.evaluation.rivals import Rivals, rivals_of
 from lidardesign.limits import MOST_RAYS
 from lidardesign.numerics import ROUNDING
@@ -143,7 +143,10 @@ def _audit(
     return Audit(
         metric.tolerance,
         metric.unit,
-        audit_rows(rows, _rows(request, entries, scored), metric),
+        [
+            AuditRow(row, other, *paired_difference(row.per_scene, other.per_scene, row.groups, limits=metric.limits))
+            for row, other in zip(rows, _rows(request, entries, scored), strict=True)
+        ],
         skipped=[planned.name for planned, every in paired if every.scenes_on > planned.scenes_on],
         unavailable=[every.name for _, every in paired if every.missing is not None],
     )

@@ -73,12 +73,11 @@ class Trial:
 def held_back_scorer(training: TrainingScenes, planner: Planner | None = None) -> TrainingScorer:
     """The scorer of trials, on training scenes that were held back, under the effects that the first ones call for."""
     run, first = training.run, training.first(HELD_BACK)
-    scenes = itertools.chain(first, training.scenes(HELD_BACK, len(first)))
     return TrainingScorer(
         run.task,
         run.metric,
         training.seed,
-        scenes,
+        itertools.chain(first, training.scenes(HELD_BACK, len(first))),
         planner,
         plans_once=True,
         preparation=Preparation.of_run(training, planner),

@@ -18,7 +18,7 @@ import numpy as np
 
 from lidardesign.errors import BackgroundNote, ConfigError
 from lidardesign.methods.movable import MovableSensors
-from lidardesign.problem.method import API_VERSION, DESIGN
+from lidardesign.problem.method import DESIGN, Method
 from lidardesign.problem.problem import DesignResult, Problem, ray_design
 from lidardesign.problem.world import World
 from lidardesign.run.clock import phase
@@ -88,14 +88,12 @@ class SearchRecord:
         )
 
 
-class Cma:
+class Cma(Method):
     """The method: see `Method`; every number of rays is a search of its own, whose record is in the provenance."""
 
     name = CMA
     summary = "direct optimisation of the first design's sensors on training scenes"
-    api_version = API_VERSION
     needs = frozenset({DESIGN})
-    is_redrawn = False
 
     def refuses(self, problem: Problem) -> str | None:
         """See `Method`: a search starts from single patterns of the first design."""
@@ -115,8 +113,8 @@ class Cma:
                 where=f"--baseline {CMA}",
                 allowed="at least one design",
             )
-        found = world.known(self.name, lambda: self._search(problem)).found(self._count(problem))
-        return DesignResult(found)
+        search = world.known(self.name, lambda: self._search(problem))
+        return DesignResult(search.found(self._count(problem)))
 
     def _count(self, problem: Problem) -> int:
         limit, readout = problem.limit_mbps, problem.readout

@@ -26,7 +26,7 @@ from lidardesign.methods.laid_out import even_layout, most_within, rays_at
 from lidardesign.methods.returns import RAY_AXES, TrainingReturns, returns_of, whole_range
 from lidardesign.methods.silhouette import LEAST_SHARE, lattice_rays, survey
 from lidardesign.numerics import COARSE_SLACK
-from lidardesign.problem.method import API_VERSION, INFORMS
+from lidardesign.problem.method import INFORMS, Method
 from lidardesign.problem.problem import DesignResult, Fired, Problem, ray_design
 from lidardesign.rays.information import informs_rays
 from lidardesign.rays.proposals import CANDIDATES_PER_RAY
@@ -47,14 +47,12 @@ MOST_CHOSEN = 2000
 SMALLEST_SHARE = 0.1  # of even rays that return: where fewer do, candidates are those that return most often
 
 
-class Greedy:
+class Greedy(Method):
     """The method: see `Method`."""
 
     name = "greedy"
     summary = "rays and gates chosen on training scenes as a design's are, without a density"
-    api_version = API_VERSION
     needs = frozenset({INFORMS})
-    is_redrawn = False
 
     def refuses(self, problem: Problem) -> str | None:
         """See `Method`: choosing many rays would take longer than all else in an evaluation."""

@@ -16,7 +16,7 @@ import numpy as np
 from lidardesign.limits import MOST_RAYS
 from lidardesign.methods.fields import even_placement
 from lidardesign.methods.returns import RAY_AXES, whole_range
-from lidardesign.problem.method import API_VERSION
+from lidardesign.problem.method import Method
 from lidardesign.problem.problem import DesignResult, Problem, ray_design
 from lidardesign.run.clock import phase
 from lidardesign.scenes.rays import Rays
@@ -87,24 +87,18 @@ class Layout:
 
 
 @dataclass(frozen=True, eq=False)
-class LaidOut:
+class LaidOut(Method):
     """A method whose rays follow from their number: of several layouts the best one on training scenes.
 
     Arguments:
-        name, summary, needs, is_redrawn: See `Method`.
+        name, summary, is_redrawn: See `Method`.
         layouts: Its layouts for a problem; none where training scenes return nothing.
     """
 
     name: str
     summary: str
     layouts: Callable[[Problem], Sequence[Layout]]
-    needs: frozenset[str] = frozenset()
     is_redrawn: bool = False
-    api_version: int = API_VERSION
-
-    def refuses(self, problem: Problem) -> str | None:
-        """See `Method`."""
-        return None
 
     def design(self, problem: Problem) -> DesignResult | None:
         """See `Method`."""
@@ -129,8 +123,7 @@ def even_layout(space: DesignSpace) -> Layout:
     """Rays even on the sphere over the whole design space, with the whole range as their gate."""
 
     def lay_out(count: int, site: Site) -> tuple[np.ndarray, np.ndarray]:
-        points = even_placement(site.space.low[:RAY_AXES], site.space.high[:RAY_AXES], count)
-        return points, whole_range(space)
+        return even_placement(site.space.low[:RAY_AXES], site.space.high[:RAY_AXES], count), whole_range(space)
 
     return Layout("even", lay_out)
 

@@ -13,7 +13,7 @@ from lidardesign.constraints.document import Constraints
 from lidardesign.errors import ConfigError, DataError, InfeasibleError
 from lidardesign.fitting.fit import fit_design
 from lidardesign.fitting.request import FitRequest, RunTarget, Weighting
-from lidardesign.problem.method import API_VERSION, DESIGN
+from lidardesign.problem.method import DESIGN, Method
 from lidardesign.problem.problem import DesignResult, Problem
 from lidardesign.run_folder import RunFolder, ignore
 from lidardesign.samples import Samples
@@ -26,18 +26,12 @@ TWIN_NAME = "no-visibility"
 FEWER_RAYS = 0.9  # of those that did not fit in a bandwidth
 
 
-class WithoutVisibility:
+class WithoutVisibility(Method):
     """The method: see `Method`."""
 
     name = TWIN_NAME
     summary = "the first design refitted to the density without its occlusion term"
-    api_version = API_VERSION
     needs = frozenset({DESIGN})
-    is_redrawn = False
-
-    def refuses(self, problem: Problem) -> str | None:
-        """See `Method`."""
-        return None
 
     def design(self, problem: Problem) -> DesignResult | None:
         """See `Method`: as many rays as the design of a bandwidth fires, or fewer where its own gates need more.

@@ -25,7 +25,7 @@ INFORMS, DESIGN = "informs", "design"
 
 
 class Method(Protocol):
-    """A way to make a design.
+    """A way to make a design; a subclass has what is usual.
 
     Arguments:
         name: Of its entry point.
@@ -37,12 +37,13 @@ class Method(Protocol):
 
     name: str
     summary: str
-    api_version: int
-    needs: frozenset[str]
-    is_redrawn: bool
+    api_version: int = API_VERSION
+    needs: frozenset[str] = frozenset()
+    is_redrawn: bool = False
 
     def refuses(self, problem: Problem) -> str | None:
         """The reason why it makes no design for a problem; None where it makes one, empty where nobody need know."""
+        return None
 
     def design(self, problem: Problem) -> DesignResult | None:
         """The design for a problem; None where any number of rays fits in its bandwidth.

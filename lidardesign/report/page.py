@@ -173,7 +173,6 @@ def _sections(report: Report) -> list[tuple[str, str, str]]:
     looks = {curve.name: curve for curve in series(evaluation)}
     looks = {name: replace(look, dash=DASHES[index % len(DASHES)]) for index, (name, look) in enumerate(looks.items())}
     shown = [looks[one.name] for one in designs]
-    sweeps = evaluation.accuracy.sweeps if evaluation.accuracy else ()
     return [
         ("result", "Result", result_section(evaluation, designs)),
         ("sensors", "Sensors", sensors_section(designs)),
@@ -185,7 +184,11 @@ def _sections(report: Report) -> list[tuple[str, str, str]]:
         ("constraints", "Constraints and how tight each is", constraints_section(report.constraints)),
         ("physics", "Physics", effects_section(evaluation) if evaluation.effects else ""),
         ("audit", "Audit of the physics", audit_section(evaluation)),
-        ("accuracy", "What accuracy costs", accuracy_section(sweeps)),
+        (
+            "accuracy",
+            "What accuracy costs",
+            accuracy_section(evaluation.accuracy.sweeps if evaluation.accuracy else ()),
+        ),
         ("time", "Where the time went", times_section(report.times)),
         ("reproduce", "How to reproduce this", rendered("report/templates/reproduce.html", how=report.reproduce)),
     ]

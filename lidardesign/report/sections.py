@@ -106,8 +106,7 @@ def mounting_section(evaluation: Evaluation) -> str:
     mounting = evaluation.mounting
     lines = () if mounting is None else zip(mounting.rows, evaluation.rows, mounting.costs, strict=True)
     rows = [(row, own, cost, verdict(evaluation, cost)) for row, own, cost in lines]
-    unit = evaluation.metric.unit
-    return rendered("report/templates/mounting.html", mounting=mounting, rows=rows, unit=unit)
+    return rendered("report/templates/mounting.html", mounting=mounting, rows=rows, unit=evaluation.metric.unit)
 
 
 def constraints_section(designs: Mapping[str, Sequence[ConstraintSlack]]) -> str:

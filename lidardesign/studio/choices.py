@@ -19,6 +19,7 @@ from lidardesign.api.run import Run
 from lidardesign.constraints.document import Constraints, SensorConstraints
 from lidardesign.constraints.slack import room_of, split_name
 from lidardesign.errors import ConfigError, pasted
+from lidardesign.run.markup import counted
 from lidardesign.run.validation import parse_override
 from lidardesign.run_folder import ignore
 from lidardesign.sensors.sensor import Sensor, boresight_frame
@@ -97,7 +98,7 @@ class Choices:
     def headline(self) -> str:
         """What the design is, in a line."""
         state = "changed since the fit" if self.state == "changed" else f"as {self.state}"
-        sensors = f"{len(self.sensors)} sensor{'s' * (len(self.sensors) != 1)}"
+        sensors = counted(len(self.sensors), "sensor")
         return f"{self.design.name} ({state}): {sensors}, {self.design.usual_count(ignore)} rays"
 
     @property

@@ -17,6 +17,7 @@ from lidardesign.cli.terminal.options import command_line
 from lidardesign.cli.terminal.output import Output, announce, keep_times, written_file
 from lidardesign.errors import ConfigError
 from lidardesign.run.clock import phase
+from lidardesign.run.markup import counted
 from lidardesign.run.outputs import check_outputs
 
 # Where a note begins to explain itself.
@@ -66,9 +67,8 @@ def export(
         keep_times(source.folder, "export", output)
 
     def show(rich: RichConsole) -> None:
-        count, noun = (exported.rays, "ray") if exported.rays else (exported.sensors, "sensor")
-        content = f"{count} {noun}{'s' * (count != 1)}"
-        rich.print(f"wrote {target} ({content})", soft_wrap=True)
+        content = (exported.rays, "ray") if exported.rays else (exported.sensors, "sensor")
+        rich.print(f"wrote {target} ({counted(*content)})", soft_wrap=True)
 
     document = {"design": str(design), **exported.as_dict()}
     output.result(document, show, files={"wrote": target} if output.quiet else None, says_time=True)

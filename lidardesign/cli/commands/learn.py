@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -53,12 +53,7 @@ def learn(
 
     request = LearnRequest.resolve(task, choices, output.remark)
     request = replace(request, command=("lidardesign", *sys.argv[1:]))
-    said: list[str] = []
-
-    def remark(note: str) -> None:
-        said.append(note)
-        output.remark(note)
-
+    remark = cache(output.remark)  # every note once
     for note in request.task_notes():
         remark(note)
     if dry_run:
@@ -70,8 +65,7 @@ def learn(
         result = request.run(partial(_show_progress, progress), remark)
     keep_times(request.folder, "learn", output, wait_s=WAIT_S)
     for note in result.notes:
-        if note not in said:
-            output.remark(note)
+        remark(note)
 
     def show(rich: RichConsole) -> None:
         if output.verbose:

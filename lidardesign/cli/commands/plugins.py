@@ -77,14 +77,15 @@ def _show_laws(title: str, document: Mapping[str, Any], rich: RichConsole) -> No
     )
 
 
+SHOWN_FORMATS = {
+    "format": "name", "suffix": "suffix", "what it is": "summary", "for": "reader", "how that is checked": "checked",
+}  # fmt: skip
+SHOWN_METHODS = {"method": "name", "what it makes": "summary", "from": "distribution"}
+
+
 def print_formats(output: Output) -> None:
     """Print all formats of exports."""
-    shown = {"format": "name", "suffix": "suffix", "what it is": "summary", "for": "reader"}
-    list_plugins(_formats(), {**shown, "how that is checked": "checked"}, output)
-
-
-def _print_methods(output: Output) -> None:
-    list_plugins(_methods(), {"method": "name", "what it makes": "summary", "from": "distribution"}, output)
+    list_plugins(_formats(), SHOWN_FORMATS, output)
 
 
 def _formats() -> "PluginKind[Any]":
@@ -101,7 +102,7 @@ def _methods() -> "PluginKind[Any]":
 
 def _plugin_app(
     kind: Callable[[], "PluginKind[Any]"],
-    print_all: Callable[[Output], None],
+    shown: Mapping[str, str],
     named: Callable[[], list[str]],
     *,
     noun: str,
@@ -112,7 +113,7 @@ def _plugin_app(
 
     Arguments:
         kind: Loads the kind.
-        print_all: Prints all plugins.
+        shown: The facts that a table of all has, by their headings.
         named: Completes a name.
         noun: One of them in messages.
         what: All of them in the help.
@@ -124,7 +125,7 @@ def _plugin_app(
     @app.command("list", help=f"List the installed {noun}s; a broken one with its reason.")
     @command_line(Brief)
     def list_(output: Output) -> None:
-        print_all(output)
+        list_plugins(kind(), shown, output)
 
     @app.command("show", help=f"Show a {noun}: {told}.")
     @command_line(Brief)
@@ -145,7 +146,7 @@ def _plugin_app(
 
 formats_app = _plugin_app(
     _formats,
-    print_formats,
+    SHOWN_FORMATS,
     options.formats,
     noun="format",
     what="formats of exports",
@@ -153,7 +154,7 @@ formats_app = _plugin_app(
 )
 methods_app = _plugin_app(
     _methods,
-    _print_methods,
+    SHOWN_METHODS,
     options.methods,
     noun="method",
     what="methods that make designs",

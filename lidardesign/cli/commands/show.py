@@ -16,6 +16,7 @@ from lidardesign.cli.terminal.options import command_line
 from lidardesign.cli.terminal.output import Output
 from lidardesign.errors import ConfigError, LidardesignError
 from lidardesign.run.clock import phase
+from lidardesign.run.markup import counted
 
 if TYPE_CHECKING:
     from lidardesign.sensors.compare import BandwidthUse
@@ -217,7 +218,7 @@ def _show_differences(files: Sequence[Path], designs: Sequence[DesignSpec], outp
 
 def _show_pair(document: dict[str, Any], rich: RichConsole) -> None:
     for place, design in zip(("first", "second"), document["designs"], strict=True):
-        sensors = "1 sensor" if design["sensors"] == 1 else f"{design['sensors']} sensors"
+        sensors = counted(design["sensors"], "sensor")
         cost = design["bandwidth"]
         rays = "rays left open" if cost["rays"] is None else f"{cost['rays']} rays, {number(cost['high_mbps'])} Mbit/s"
         rich.print(f"{place}: {design['name']}, {sensors}, layout {design['layout']}, {rays}", soft_wrap=True)

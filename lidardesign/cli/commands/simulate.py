@@ -14,6 +14,7 @@ from lidardesign.cli.terminal.options import command_line
 from lidardesign.cli.terminal.output import Output, announce
 from lidardesign.errors import ConfigError, check_choice
 from lidardesign.run.clock import phase
+from lidardesign.run.markup import counted
 from lidardesign.run.outputs import check_outputs
 
 
@@ -60,9 +61,7 @@ def simulate(
     }
 
     def show(rich: RichConsole) -> None:
-        frames = sum(len(each.returns) for each in seen)
-        scenes_text = "1 scene" if len(seen) == 1 else f"{len(seen)} scenes"
-        frames_text = "1 frame" if frames == 1 else f"{frames} frames"
-        rich.print(f"wrote {out} ({scenes_text}, {frames_text}, {sum(counts)} returns)", soft_wrap=True)
+        frames = counted(sum(len(each.returns) for each in seen), "frame")
+        rich.print(f"wrote {out} ({counted(len(seen), 'scene')}, {frames}, {sum(counts)} returns)", soft_wrap=True)
 
     output.result(document, show, files={"wrote": out} if output.quiet else None, says_time=True)

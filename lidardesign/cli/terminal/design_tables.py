@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from lidardesign.cli.terminal.grids import RichConsole, number, print_table, text_table
+from lidardesign.run.markup import counted
 
 if TYPE_CHECKING:
     import numpy as np
@@ -40,8 +41,7 @@ def show_design(design: DesignSpec, rich: RichConsole) -> None:
         _show_along(design, rich)
     else:
         rays = f"{design.count} rays per frame" if design.count else "rays per frame left open"
-        sensors = "1 sensor" if len(design.sensors) == 1 else f"{len(design.sensors)} sensors"
-        title = f"{design.name}: {sensors}, layout {design.layout}, {rays}{_condition(design)}"
+        title = f"{_name(design)}, layout {design.layout}, {rays}{_condition(design)}"
         where, poses = _poses(design)
         cells = [
             {"sensor": pose["sensor"], "weight": f"{sensor.weight:.3f}", "rays": number(rays), **pose}
@@ -114,6 +114,10 @@ def _show_along(design: DesignSpec, rich: RichConsole) -> None:
 def _span(values: np.ndarray, decimals: int) -> str:
     low, high = (f"{round(float(v), decimals) + 0.0:.{decimals}f}" for v in (values.min(), values.max()))
     return low if low == high else f"{low} .. {high}"
+
+
+def _name(design: DesignSpec) -> str:
+    return f"{design.name}: {counted(len(design.sensors), 'sensor')}"
 
 
 def _condition(design: DesignSpec) -> str:
@@ -190,8 +194,7 @@ def _show_sensors(design: DesignSpec, rich: RichConsole) -> None:
     counts = [str(count) for count in design.counts or [design.count] if count is not None]
     several = f"{', '.join(counts[:-1])} or " if counts[:-1] else ""
     rays = f"{several}{counts[-1]} rays {_frames(design)}" if counts else "any number of rays"
-    sensors = "1 sensor" if len(design.sensors) == 1 else f"{len(design.sensors)} sensors"
-    rich.print(f"{design.name}: {sensors}, {rays} (layout {design.layout}){_condition(design)}", soft_wrap=True)
+    rich.print(f"{_name(design)}, {rays} (layout {design.layout}){_condition(design)}", soft_wrap=True)
     where, cells = _poses(design)
     rich.print(where, soft_wrap=True)
     if counts:

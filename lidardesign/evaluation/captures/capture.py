@@ -185,7 +185,6 @@ def load_capture(path: Path) -> Capture:
     pixels = counts.shape[:-1]
     counts = counts.reshape(-1, counts.shape[-1])
     rows = max(1, CHUNK // counts.shape[1])
-    seen = False
     for first in range(0, len(counts), rows):
         part = counts[first : first + rows]
         if part.dtype.kind == "f":
@@ -195,10 +194,8 @@ def load_capture(path: Path) -> Capture:
         # some types of counts do not reach the limit
         most = min(MOST_COUNTS, float(np.finfo(part.dtype).max)) if part.dtype.kind == "f" else MOST_COUNTS
         _refuse_counts(part > most, part, first, f"at most {MOST_COUNTS:.3g}", where)
-        seen = seen or bool(part.any())
-    if not seen:
+    if not counts.any():
         raise DataError("all counts are zero: no photon was captured", where=where)
-    pulse = _scalar(arrays, "pulse_fwhm_ps", where) if "pulse_fwhm_ps" in arrays else None
     origin = np.asarray(arrays["origin_m"], dtype=np.float64)
     if origin.size != 3:
         raise _shape("origin_m", origin, "(3,)", where)
@@ -213,7 +210,7 @@ def load_capture(path: Path) -> Capture:
         _finite(origin.reshape(3), "origin_m", where),
         _directions(arrays, pixels, where),
         _per_pixel(arrays, "true_range_m", pixels, where) if "true_range_m" in arrays else None,
-        pulse,
+        _scalar(arrays, "pulse_fwhm_ps", where) if "pulse_fwhm_ps" in arrays else None,
     )
     _check_values(capture, where)
     return capture
