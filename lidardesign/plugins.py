@@ -7,7 +7,6 @@ signal reaches Python, affects only that process.
 from __future__ import annotations
 
 import contextlib
-import difflib
 import faulthandler
 import functools
 import os
@@ -20,6 +19,7 @@ from typing import Any, Generic, NoReturn, TypeVar
 from lidardesign.errors import ConfigError, DataError, LidardesignError, PluginError, lacks_memory, text_of
 from lidardesign.run.clock import phase
 from lidardesign.run.processes import START_SECONDS, Child, ChildError
+from lidardesign.run.validation import suggest
 
 # Environment variable of a probing process, so that a plugin that loads others starts no further ones.
 PROBING = "LIDARDESIGN_PROBING"
@@ -113,12 +113,11 @@ class PluginKind(Generic[T]):
         """
         found = self._offers()
         if name not in found:
-            close = difflib.get_close_matches(name, found, n=1)
             raise UnknownPluginError(
                 f"unknown {self.noun} {name!r}",
                 where=self.noun.upper(),
                 allowed=self.allowed(),
-                hint=f"did you mean {close[0]!r}?" if close else f"lidardesign {self.noun}s list",
+                hint=suggest(name, found) or f"lidardesign {self.noun}s list",
             )
         offer, *others = found[name]
         if others:

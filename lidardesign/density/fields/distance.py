@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
+from types import ModuleType
 
 import numpy as np
 
@@ -20,6 +21,20 @@ from lidardesign.scenes.scene import Body, Mesh, Scene
 
 MAXIMUM_TABLE_BYTES = 6 * 2**30
 FAR_M = np.float32(1e9)  # the distance of a column without a mesh in the table
+
+
+def body_kernels() -> ModuleType:
+    """The compiled loops over bodies, which take 0.8 s to load: when they are first used."""
+    from lidardesign.density.fields import body_kernels
+
+    return body_kernels
+
+
+def table_kernels() -> ModuleType:
+    """The compiled loops over tables, likewise."""
+    from lidardesign.density.fields import table_kernels
+
+    return table_kernels
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,20 +66,16 @@ class GridColumns:
         points = np.ascontiguousarray(points, dtype=np.float64)
         if not self.compiled:
             return grids.table_values(self.arrays, points, grows=grows)
-        from lidardesign.density.fields import table_kernels
-
-        out = np.empty((len(points), self.columns), dtype=np.float32)
-        (table_kernels.table_distances if grows else table_kernels.table_values)(self.arrays, points, out)
+        kernels, out = table_kernels(), np.empty((len(points), self.columns), dtype=np.float32)
+        (kernels.table_distances if grows else kernels.table_values)(self.arrays, points, out)
         return out
 
     def _contract(self, points: np.ndarray, weights: np.ndarray, *, grows: bool) -> np.ndarray:
         """Gradients of sum_c weights_nc * value_c(points_n): (N, 3), (N, columns) to (N, 3)."""
-        from lidardesign.density.fields import table_kernels
-
         points, weights = (np.ascontiguousarray(values, dtype=np.float64) for values in (points, weights))
         out = np.empty_like(points)
-        kernel = table_kernels.table_gradient if grows else table_kernels.table_value_gradient
-        kernel(self.arrays, points, weights, out)
+        kernels = table_kernels()
+        (kernels.table_gradient if grows else kernels.table_value_gradient)(self.arrays, points, weights, out)
         return out
 
 
@@ -94,11 +105,9 @@ class TableField(GridColumns):
 
 def all_pairs(bodies: Bodies, points: np.ndarray) -> Pairs:
     """Points (N, 3) with all columns."""
-    from lidardesign.density.fields import body_kernels
-
     shape = len(points), bodies.columns
     distances, nearest = np.empty(shape), np.empty(shape, dtype=np.int64)
-    body_kernels.all_distances(bodies.arrays, np.ascontiguousarray(points, dtype=np.float64), distances, nearest)
+    body_kernels().all_distances(bodies.arrays, np.ascontiguousarray(points, dtype=np.float64), distances, nearest)
     columns = np.tile(np.arange(shape[1]), shape[0])
     return Pairs(np.arange(shape[0] + 1) * shape[1], columns, distances.ravel(), nearest.ravel())
 
@@ -124,13 +133,11 @@ class BodyField:
 
     def gradient(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """See `TableField`."""
-        from lidardesign.density.fields import body_kernels
-
         points = np.ascontiguousarray(points, dtype=np.float64)
         pairs, out = all_pairs(self.bodies, points), np.empty_like(points)
         # a column without bodies has no nearest one, and no gradient
         pulls = np.where(pairs.bodies >= 0, np.ravel(weights), 0.0)
-        body_kernels.add_gradients(self.bodies.arrays, points, pairs.row_starts, pairs.bodies, pulls, out)
+        body_kernels().add_gradients(self.bodies.arrays, points, pairs.row_starts, pairs.bodies, pulls, out)
         return out
 
 

@@ -23,6 +23,7 @@ from lidardesign.density.fields.distance import (
     UnionField,
     all_pairs,
     bodies_by_rest,
+    body_kernels,
     check_table,
 )
 from lidardesign.density.fields.grids import (
@@ -131,21 +132,17 @@ class BodyWeights:
 
     def of_pairs(self, points: np.ndarray, pairs: Pairs) -> np.ndarray:
         """log w of pairs of points (N, 3) and columns, shape (P,)."""
-        from lidardesign.density.fields import body_kernels
-
         points, values = np.ascontiguousarray(points, dtype=np.float64), self.bodies.grids.log_weights
         constants, out = np.ascontiguousarray(self.bodies.log_weight[:, 0]), np.empty(len(pairs.bodies))
-        body_kernels.pair_log_weights(
+        body_kernels().pair_log_weights(
             self.bodies.arrays, constants, values, points, pairs.row_starts, pairs.bodies, out
         )
         return out
 
     def add_pair_gradients(self, points: np.ndarray, pairs: Pairs, weights: np.ndarray, out: np.ndarray) -> None:
         """Add the gradients of sum_p weights_p log w_p by the points to `out` (N, 3)."""
-        from lidardesign.density.fields import body_kernels
-
         points, values = np.ascontiguousarray(points, dtype=np.float64), self.bodies.grids.log_weights
-        body_kernels.add_log_weight_gradients(
+        body_kernels().add_log_weight_gradients(
             self.bodies.arrays, values, points, pairs.row_starts, pairs.bodies, weights, out
         )
 

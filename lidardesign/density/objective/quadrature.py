@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from lidardesign.density.fields.distance import Field, TableField
+from lidardesign.density.fields.distance import Field, TableField, table_kernels
 from lidardesign.density.objective.visibility import (
     ROWS_AT_ONCE,
     Columns,
@@ -67,10 +67,8 @@ class Quadrature(Visibility):
         self.field, self.points = field, points
         self._shell_m = float(field.shell_m.max(initial=0.0))
         if isinstance(field, TableField):
-            from lidardesign.density.fields import table_kernels
-
             self._clear = np.empty(len(field.table), dtype=np.float32)
-            table_kernels.cell_minimum(field.table, field.grid.counts, self._clear)
+            table_kernels().cell_minimum(field.table, field.grid.counts, self._clear)
             self._clear -= np.float32(self._shell_m)
 
     @property
@@ -97,12 +95,10 @@ class Quadrature(Visibility):
     ) -> Slopes:
         count, columns = rows.stop - rows.start, self.field.columns
         if isinstance(self.field, TableField):
-            from lidardesign.density.fields import table_kernels
-
             room = count * self.points if differentiable else 0
             starts, midpoints = np.zeros(count + 1, dtype=np.int64), np.empty(room, dtype=np.int64)
             slopes = starts, midpoints, np.empty((room, columns), dtype=np.float32)
-            table_kernels.table_quadrature(
+            table_kernels().table_quadrature(
                 self.field.arrays, self._clear, self.field.shell_m,
                 (rays.origins[rows], rays.directions[rows], lengths[rows]), self.points,
                 optics.attenuation_per_m, optics.sharpness_per_m, CUTOFF_LENGTHS / optics.sharpness_per_m,
@@ -125,9 +121,7 @@ class Quadrature(Visibility):
         rows: slice, slopes: Slopes, weights: np.ndarray, out: RayGradient,
     ) -> None:  # fmt: skip
         if isinstance(self.field, TableField):
-            from lidardesign.density.fields import table_kernels
-
-            table_kernels.table_quadrature_gradient(
+            table_kernels().table_quadrature_gradient(
                 self.field.arrays, (rays.origins[rows], rays.directions[rows], lengths[rows]), self.points, slopes,
                 least, np.ascontiguousarray(weights), (out.origins[rows], out.directions[rows], out.ranges[rows]),
             )  # fmt: skip

@@ -24,7 +24,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lidardesign.density.fields.bodies import GROUP_COLUMNS, Bodies, Pairs, occluding_bodies
-from lidardesign.density.fields.distance import Field, scene_columns
+from lidardesign.density.fields.distance import Field, body_kernels, scene_columns
 from lidardesign.density.fields.importance import BodyWeights, LogWeights
 from lidardesign.density.objective.visibility import BodyRaycast, Raycast, Visibility
 from lidardesign.numerics import TINY, logsumexp
@@ -181,11 +181,9 @@ class _NearFrames:
         return row_log_sums(self.surface + log_transmittance, self.columns)
 
     def gradient(self, shares: np.ndarray) -> np.ndarray:
-        from lidardesign.density.fields import body_kernels
-
         pairs, by_point = self.columns, np.empty_like(self.observed)
         weights = -shares * pairs.distances / self.sigma_m**2
-        body_kernels.add_gradients(
+        body_kernels().add_gradients(
             self.frames.bodies.arrays, self.observed, pairs.row_starts, pairs.bodies, weights, by_point
         )
         if self.frames.importance is not None:
@@ -298,8 +296,6 @@ class MovingFrames:
             generator: Of all draws.
             reach_m: Corners of a box; of bodies much larger than it only points in there are drawn.
         """
-        from lidardesign.density.fields import body_kernels
-
         bodies = self.bodies
         low, high = bodies.low - REACH_SIGMAS * sigma_m, bodies.high + REACH_SIGMAS * sigma_m
         weights = np.exp(self.log_column_weights[bodies.column])
@@ -315,7 +311,7 @@ class MovingFrames:
             body = np.searchsorted(cumulated, generator.random(DRAWS_AT_ONCE), side="right").clip(max=len(bodies) - 1)
             points = generator.uniform(low[body], high[body])
             distances = np.empty(len(points))
-            body_kernels.distances_of(bodies.arrays, body, points, distances)
+            body_kernels().distances_of(bodies.arrays, body, points, distances)
             accepted.append(points[generator.random(len(points)) < np.exp(-np.square(distances / sigma_m) / 2)])
             if sum(map(len, accepted)) >= count:
                 break
@@ -344,15 +340,13 @@ def near_pairs(
     bodies: Bodies, points: np.ndarray, log_weights: np.ndarray, sigma_m: float, tolerance_nats: float
 ) -> Pairs:
     """Points (N, 3) with the columns whose surface term is within a tolerance of the best one there."""
-    from lidardesign.density.fields import body_kernels
-
     points = np.ascontiguousarray(points, dtype=np.float64)
     row_starts = np.empty(len(points) + 1, dtype=np.int64)
     group_weights = np.maximum.reduceat(log_weights, np.arange(0, bodies.columns, GROUP_COLUMNS))
     room = max(min(PAIRS_PER_ROW, bodies.columns) * len(points), 1)
     while True:
         out = np.empty(room, dtype=np.int64), np.empty(room), np.empty(room, dtype=np.int64)
-        count = body_kernels.near_columns(
+        count = body_kernels().near_columns(
             bodies.arrays, bodies.group_edges, points, log_weights, group_weights, 1.0 / sigma_m**2, tolerance_nats,
             row_starts, out,
         )  # fmt: skip

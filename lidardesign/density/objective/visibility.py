@@ -29,7 +29,7 @@ from scipy.special import expit, log_expit
 
 from lidardesign.config import DensitySettings
 from lidardesign.density.fields.bodies import Bodies, Pairs
-from lidardesign.density.fields.distance import scene_columns
+from lidardesign.density.fields.distance import body_kernels, scene_columns
 from lidardesign.errors import ConfigError
 from lidardesign.scenes.casting import shared_caster, trace_each
 from lidardesign.scenes.rays import receiver_axes
@@ -291,13 +291,11 @@ class BodyRaycast(Visibility):
 
     def first_hits(self, rays: RayBatch, pairs: Pairs, limit_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Ranges of first hits before a limit, infinite without one (P,), and normals facing the origin (P, 3)."""
-        from lidardesign.density.fields import body_kernels
-
         bodies, count, lines = self.bodies, len(pairs.columns), (rays.origins, rays.directions, limit_m)
         hits, normals, room = np.empty(count), np.empty((count, 3)), MESHES_PER_PAIR * count * bool(self._casters)
         while True:
             met = tuple(np.empty(room, dtype=np.int64) for _ in range(3))
-            meshes = body_kernels.first_hits(
+            meshes = body_kernels().first_hits(
                 bodies.arrays, bodies.mesh_bounds, pairs.row_starts, pairs.columns, lines, hits, normals, met
             )
             if meshes <= room:
@@ -311,8 +309,6 @@ class BodyRaycast(Visibility):
         self, rays: RayBatch, limit_m: np.ndarray, met: tuple[np.ndarray, ...], hits: np.ndarray, normals: np.ndarray
     ) -> None:
         """Enter first hits on meshes before those on primitives; `met` are rays, pairs and bodies, (K,) each."""
-        from lidardesign.density.fields import body_kernels
-
         bodies = self.bodies
         # all of one mesh together; small integers are sorted fast
         number = bodies.grid[met[2]]
@@ -321,7 +317,7 @@ class BodyRaycast(Visibility):
         row, pair, body = (values[order] for values in met)
         starts = np.searchsorted(number[order], np.arange(1, len(self._casters) + 2))
         local = np.empty((len(row), 3)), np.empty((len(row), 3))
-        body_kernels.rays_in_frames(bodies.to_body, body, row, (rays.origins, rays.directions), local)
+        body_kernels().rays_in_frames(bodies.to_body, body, row, (rays.origins, rays.directions), local)
         for caster, first, last in zip(self._casters, starts[:-1], starts[1:], strict=True):
             origins, directions = local[0][first:last], local[1][first:last]
             limits = np.minimum(limit_m[row[first:last]], hits[pair[first:last]])
