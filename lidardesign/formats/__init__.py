@@ -151,11 +151,15 @@ def _write_contained(format: Format, design: DesignSpec, rays: Rays, path: Path,
             found = f"wrote no {'folder' if format.is_folder else 'file'}"
             raise PluginError(found, where=f"format {format.name}", hint=AUTHOR_HINT)
         if format.is_folder:
-            files = [file for file in sorted(staged.rglob("*")) if file.is_file()]
-            contents = {file.relative_to(staged).as_posix(): file.read_bytes() for file in files}
-            return [*write_folder(path, contents), *notes]
+            return [*write_folder(path, folder_contents(staged)), *notes]
         write_atomic(path, staged.read_bytes())
     return notes
+
+
+def folder_contents(folder: Path) -> dict[str, bytes]:
+    """The content of all files of a folder by their names."""
+    files = (path for path in sorted(folder.rglob("*")) if path.is_file())
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
 
 
 def check_rate(format: Format, rate_hz: float | None) -> None:
