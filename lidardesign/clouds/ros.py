@@ -122,8 +122,11 @@ def mcap_content(clouds: Sequence[tuple[int, bytes]], transforms: bytes) -> byte
     try:
         from mcap.writer import CompressionType, Writer
     except ImportError:
-        hint = "pip install 'lidardesign[mcap]', or --format ply"
-        raise ConfigError("the library mcap is not installed", where="--format mcap", hint=hint) from None
+        raise ConfigError(
+            "the library mcap is not installed",
+            where="--format mcap",
+            hint="pip install 'lidardesign[mcap]', or --format ply",
+        ) from None
     file = BytesIO()
     # without compression the same messages are the same bytes with every version of the libraries
     writer = Writer(file, compression=CompressionType.NONE)

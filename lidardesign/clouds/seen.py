@@ -251,7 +251,10 @@ def scene_of_file(path: Path, mount: str | None, scale: float = 1.0) -> Scene:
     if mount is not None:
         names = [model.body(number).name for number in range(model.nbody)]
         if mount not in names:
-            allowed = ", ".join(filter(None, names))
-            raise DataError(f"has no body {mount!r}, which the design is mounted on", where=str(path), allowed=allowed)
+            raise DataError(
+                f"has no body {mount!r}, which the design is mounted on",
+                where=str(path),
+                allowed=", ".join(filter(None, names)),
+            )
         poses = inverse_rigid(poses[:, names.index(mount)])[:, None] @ poses
     return Scene(tuple(geom.at(poses) for geom in visible_geoms(model)[0]), path.stem)

@@ -85,8 +85,12 @@ def check_format(name: str, found: Any) -> dict[str, Any]:
         allowed = ", ".join(HELD) if unknown else "a dot, then a name"
         raise PluginError(wrong, where=f"format {name}", allowed=allowed, hint=AUTHOR_HINT)
     facts = {key: getattr(found, key) for key in ("summary", "suffix", "reader", "checked")}
-    reads = getattr(found, "read", None) is not None
-    return {**facts, "folder": found.is_folder, "holds": sorted(found.holds), "reads": reads}
+    return {
+        **facts,
+        "folder": found.is_folder,
+        "holds": sorted(found.holds),
+        "reads": getattr(found, "read", None) is not None,
+    }
 
 
 FORMATS: PluginKind[Format] = PluginKind("lidardesign.formats", "format", check_format)
@@ -148,14 +152,19 @@ def _write_contained(format: Format, design: DesignSpec, rays: Rays, path: Path,
         with plugin_guard(format.name, "format"):
             notes = [str(note) for note in format.write(design, rays, staged, options)]
         if not (staged.is_dir() if format.is_folder else staged.is_file()):
-            found = f"wrote no {'folder' if format.is_folder else 'file'}"
-            raise PluginError(found, where=f"format {format.name}", hint=AUTHOR_HINT)
+            raise PluginError(
+                f"wrote no {'folder' if format.is_folder else 'file'}", where=f"format {format.name}", hint=AUTHOR_HINT
+            )
         if format.is_folder:
-            files = [file for file in sorted(staged.rglob("*")) if file.is_file()]
-            contents = {file.relative_to(staged).as_posix(): file.read_bytes() for file in files}
-            return [*write_folder(path, contents), *notes]
+            return [*write_folder(path, folder_contents(staged)), *notes]
         write_atomic(path, staged.read_bytes())
     return notes
+
+
+def folder_contents(folder: Path) -> dict[str, bytes]:
+    """The content of all files of a folder by their names."""
+    files = (path for path in sorted(folder.rglob("*")) if path.is_file())
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
 
 
 def check_rate(format: Format, rate_hz: float | None) -> None:

@@ -18,6 +18,7 @@ import numpy as np
 
 from lidardesign.errors import DataError
 from lidardesign.formats.names import distinct, identifier
+from lidardesign.formats.rig import members
 from lidardesign.numerics import COARSE_SLACK, SLACK
 from lidardesign.scenes.rays import DEFAULT_RATE_HZ, Rays
 from lidardesign.sensors.compare import angles_between
@@ -68,12 +69,10 @@ class Mount:
 def mounts(design: DesignSpec, rays: Rays) -> list[Mount]:
     """Mounts of the sensors of a design that fire rays, in their order."""
     names = distinct([identifier(sensor.name) for sensor in design.sensors], "_")
-    order = np.argsort(rays.sensor, kind="stable")
-    edges = np.searchsorted(rays.sensor[order], np.arange(len(design.sensors) + 1))
     return [
-        _mount(name, sensor, rays, order[edges[index] : edges[index + 1]])
-        for index, (name, sensor) in enumerate(zip(names, design.sensors, strict=True))
-        if edges[index] < edges[index + 1]
+        _mount(name, sensor, rays, own)
+        for name, sensor, own in zip(names, design.sensors, members(rays.sensor, len(names)), strict=True)
+        if len(own)
     ]
 
 
@@ -169,12 +168,19 @@ def places(mounted: Sequence[Mount], rays: Rays) -> list[Place]:
     found = []
     for mount in mounted:
         origins, first, place = np.unique(rays.origin_m[mount.ray], axis=0, return_index=True, return_inverse=True)
-        place = place.reshape(-1)
-        members = np.split(mount.ray[np.argsort(place, kind="stable")], np.cumsum(np.bincount(place))[:-1])
+        own = members(place.reshape(-1), len(origins))
         for number, here in enumerate(np.argsort(first)):
             name = mount.name if len(origins) == 1 else f"{mount.name}_place_{number}"
-            found.append(Place(name, mount, origins[here], members[here]))
+            found.append(Place(name, mount, origins[here], mount.ray[own[here]]))
     return found
+
+
+def near_losses(starts_m: np.ndarray, least_m: float, what: str, reason: str) -> list[str]:
+    """Note of the gates that start (N,) [m] before the least start of a format."""
+    near = np.count_nonzero(starts_m < least_m)
+    if not near:
+        return []
+    return [f"gates of {near} of {len(starts_m)} {what} start below {least_m:g} m: they start there, for {reason}"]
 
 
 def require_rays(design: DesignSpec, rays: Rays, what: str) -> None:
@@ -233,11 +239,10 @@ def nearest_grid(azimuth_rad: np.ndarray, elevation_rad: np.ndarray) -> EvenGrid
     azimuth_rad = cut_behind(azimuth_rad)
     count = len(azimuth_rad)
     shapes = [(rows, max(round(count / rows), 1)) for rows in _row_counts(azimuth_rad, elevation_rad)]
-    most = max(count // MOST_CHANGED, 1)
     grids = [
         EvenGrid(columns, rows, _fitted(azimuth_rad, columns), _fitted(elevation_rad, rows))
         for rows, columns in shapes
-        if abs(rows * columns - count) <= most
+        if abs(rows * columns - count) <= max(count // MOST_CHANGED, 1)
     ]
 
     def misfit(grid: EvenGrid) -> float:

@@ -49,6 +49,7 @@ from lidardesign.formats.mounts import (
     grid_of,
     grid_sensor_losses,
     mounts,
+    near_losses,
     origin_losses,
     places,
     require_rays,
@@ -181,10 +182,9 @@ def write_osi(design: DesignSpec, rays: Rays, path: Path, options: WriteOptions)
     # the next frame
     times_us = np.rint(fire_times_s(rays, options.rate_hz) * MICROSECONDS_PER_S)
     times_us = np.minimum(times_us, math.ceil(MICROSECONDS_PER_S / options.rate_hz) - 1)
-    cycle_ns = round(NANOSECONDS_PER_S / options.rate_hz)
     mounted = mounts(design, rays)
     found = places(mounted, rays)
-    seconds, nanoseconds = divmod(cycle_ns, NANOSECONDS_PER_S)
+    seconds, nanoseconds = divmod(round(NANOSECONDS_PER_S / options.rate_hz), NANOSECONDS_PER_S)
     whole = {
         "range": float(rays.gate_m[:, 1].max()),
         # 64-bit integers are text in protobuf's JSON
@@ -296,14 +296,13 @@ def write_isaac_usd(design: DesignSpec, rays: Rays, path: Path, options: WriteOp
     notes = [*design_losses(design, mounted), *origin_losses(mounted)]
     if whole_hz != options.rate_hz:
         notes.append(f"frame rates there are whole numbers: {options.rate_hz:g} Hz is {whole_hz} Hz")
-    near = sum(one.gate_m[0] < LEAST_START_M for one in mounted)
-    if near:
-        notes.append(
-            f"gates of {near} of {len(mounted)} sensors start below {LEAST_START_M:g} m: they start there, for Isaac's "
-            "near ranges are above 0"
-        )
-    notes.append("angles and lengths are kept in single precision, firing times in whole nanoseconds")
-    return [*notes, *renamed_note([one.sensor.name for one in mounted], [one.name for one in mounted])]
+    starts_m = np.array([one.gate_m[0] for one in mounted])
+    return [
+        *notes,
+        *near_losses(starts_m, LEAST_START_M, "sensors", "Isaac's near ranges are above 0"),
+        "angles and lengths are kept in single precision, firing times in whole nanoseconds",
+        *renamed_note([one.sensor.name for one in mounted], [one.name for one in mounted]),
+    ]
 
 
 ISAAC_USD = Format(
