@@ -17,7 +17,7 @@ import numpy as np
 
 from lidardesign.contract.law import BrokenLawError, Law, LawHolds, NotApplicable, Tried
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.formats import ADAPTIVE, EVERY_STEP, RATE, RAYS, ROBOT, Format, WriteOptions
+from lidardesign.formats import ADAPTIVE, EVERY_STEP, RATE, RAYS, ROBOT, Format, WriteOptions, folder_contents
 from lidardesign.formats.designs import load_design
 from lidardesign.formats.rig import rig_design
 from lidardesign.numerics import COARSE_SLACK
@@ -63,18 +63,15 @@ class FormatSubject(Tried):
         notes = None
         with self.calling("write"), suppress(ConfigError, DataError):
             notes = self.format.write(design, rays, path, WriteOptions(**options))
-        files = contents(path.parent)
+        files = folder_contents(path.parent)
         if notes is None and not files:
             return None
         if not (isinstance(notes, list) and (path.is_dir() if self.format.is_folder else [*files] == [path.name])):
-            found = f"{', '.join(files) or 'nothing'}, and returned {notes!r:.80}"
-            raise BrokenLawError(f"{design.name}: wrote {found}", allowed=f"{path.name} alone, and a list of notes")
+            raise BrokenLawError(
+                f"{design.name}: wrote {', '.join(files) or 'nothing'}, and returned {notes!r:.80}",
+                allowed=f"{path.name} alone, and a list of notes",
+            )
         return notes, files
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    """The content of all files of a folder by their names."""
-    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
 def check_written(subject: FormatSubject) -> LawHolds:
@@ -112,8 +109,10 @@ def check_held(subject: FormatSubject) -> LawHolds:
             changed, fired, options = changes[what]
             found = subject.write(path, changed, fired, **options)
             if not found or (without and without[1] == found[1]):
-                does = "writes the same without" if found else "refuses it"
-                raise BrokenLawError(f"says that it holds {what}, but {does}", hint=f"leave {what} out of holds")
+                raise BrokenLawError(
+                    f"says that it holds {what}, but {'writes the same without' if found else 'refuses it'}",
+                    hint=f"leave {what} out of holds",
+                )
     return LawHolds(f"holds {', '.join(sorted(subject.format.holds)) or 'sensors alone'}")
 
 
@@ -125,13 +124,15 @@ def check_whole(subject: FormatSubject) -> LawHolds:
         taken.parent.mkdir(exist_ok=True)
         taken.write_bytes(b"mine")
         for fired in (rays, replace(rays, sensor=rays.sensor + len(rays))):
-            before, failed = contents(path.parent), True
+            before, failed = folder_contents(path.parent), True
             with subject.calling("write"), suppress(Exception):
                 subject.format.write(design, fired, path, WriteOptions())
                 failed = False
-            if (before or failed) and contents(path.parent) != before:
-                what = "writes over what is in its place" if before else "leaves a half-written file where it fails"
-                raise BrokenLawError(what, hint="write what is whole: lidardesign.run.files.write_atomic")
+            if (before or failed) and folder_contents(path.parent) != before:
+                raise BrokenLawError(
+                    "writes over what is in its place" if before else "leaves a half-written file where it fails",
+                    hint="write what is whole: lidardesign.run.files.write_atomic",
+                )
             remove(path)
     return LawHolds("what is in its place stays, and nothing half-written is left")
 

@@ -6,6 +6,7 @@ Helpers of several laws are here too: rays that see a scene's targets, and pertu
 from __future__ import annotations
 
 import contextlib
+import math
 import random
 import sys
 import time
@@ -199,6 +200,7 @@ class Tried:
         limit_s: Time limit of one call of its code [s].
         drawn: Global random states that its code drew from or seeded, with the call.
         on_call: Called with a description before every call of its code, and with "" after it.
+        seconds: Longest time of each call by its description [s].
     """
 
     noun: str
@@ -206,9 +208,7 @@ class Tried:
     limit_s: float = CALL_SECONDS
     drawn: list[str] = field(default_factory=list)
     on_call: Callable[[str], None] = lambda what: None
-
-    def __post_init__(self) -> None:
-        self.seconds: dict[str, float] = {}
+    seconds: dict[str, float] = field(init=False, default_factory=dict)
 
     @contextlib.contextmanager
     def calling(self, what: str) -> Iterator[None]:
@@ -348,9 +348,10 @@ def rays_at_targets(scene: Scene, space: DesignSpace, casters: Sequence[SceneCas
     frames = np.unique(np.linspace(0, scene.frames - 1, min(scene.frames, MOST_FRAMES)).astype(int))
     found: list[np.ndarray] = []
     for _ in range(DRAW_ROUNDS):
-        for frame in frames:
-            per = -(-count // len(frames))
-            found.append(rays_that_meet(scene, space, casters[frame], int(frame), per, generator))
+        found += [
+            rays_that_meet(scene, space, casters[frame], frame, math.ceil(count / len(frames)), generator)
+            for frame in frames.tolist()
+        ]
         if sum(map(len, found)) >= count:
             break
     return full_rays(generator.permutation(np.concatenate(found))[:count], space)

@@ -134,8 +134,9 @@ def check_repeated(subject: MethodSubject) -> LawHolds:
     for first, again in zip(subject.problems(), subject.problems(), strict=True):
         one, same = subject.design(first), subject.design(again)
         if _fingerprint(one) != _fingerprint(same):
-            fault = f"{asked_text(first)}: another design the second time"
-            raise BrokenLawError(fault, hint="draw from the world's seed")
+            raise BrokenLawError(
+                f"{asked_text(first)}: another design the second time", hint="draw from the world's seed"
+            )
         other = subject.design(replace(first, draw=1)) if one and subject.method.is_redrawn else None
         if other and _fingerprint(one) == _fingerprint(other):
             raise BrokenLawError(f"{asked_text(first)}: says that it is drawn anew, and is not")

@@ -81,14 +81,7 @@ def _contracts() -> dict[str, Contract]:
 @pytest.fixture
 def task_law(request: pytest.FixtureRequest, _contracts: dict[str, Contract]) -> PluginLaw:
     """One law of the contract of one task that the setting `lidardesign_tasks` names."""
-    specification, law = request.param
-    if specification not in _contracts:
-        from lidardesign.contract.contract import contract_of
-        from lidardesign.task import load_task
-
-        name, *overrides = shlex.split(specification)
-        _contracts[specification] = contract_of(load_task(name), overrides=overrides)
-    return PluginLaw(_contracts[specification], law)
+    return _plugin_law("task", *request.param, _contracts)
 
 
 @pytest.fixture
@@ -103,11 +96,15 @@ def method_law(request: pytest.FixtureRequest, _contracts: dict[str, Contract]) 
     return _plugin_law("method", *request.param, _contracts)
 
 
-def _plugin_law(noun: str, name: str, law: str, contracts: dict[str, Contract]) -> PluginLaw:
-    from lidardesign.contract.contract import contract_of_plugin
+def _plugin_law(noun: str, specification: str, law: str, contracts: dict[str, Contract]) -> PluginLaw:
+    from lidardesign.contract.contract import contract_of, contract_of_plugin
     from lidardesign.contract.process import KINDS
 
-    key = f"{noun} {name}"
+    key = f"{noun} {specification}"
     if key not in contracts:
-        contracts[key] = contract_of_plugin(KINDS[noun], KINDS[noun].load(name))
+        name, *overrides = shlex.split(specification) if noun == "task" else [specification]
+        plugin = KINDS[noun].load(name)
+        contracts[key] = (
+            contract_of(plugin, overrides=overrides) if noun == "task" else contract_of_plugin(KINDS[noun], plugin)
+        )
     return PluginLaw(contracts[key], law)

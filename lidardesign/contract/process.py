@@ -99,13 +99,22 @@ def check_in_process(request: CheckRequest) -> Iterator[Finding]:
 
 
 def _read_findings(child: Child, seconds: float, statements: Statements) -> Iterator[Finding]:
-    """Findings as they arrive; where the child is lost, the law under trial does not hold."""
+    """Findings as they arrive; where the child is lost, the law under trial does not hold.
+
+    Raises:
+        ConfigError, DataError: A task's configuration is refused.
+    """
     for number in range(len(statements)):
         found = _next_finding(child, seconds, loading=number == 0)
         if isinstance(found, str):
             yield from _all_lost(statements[number:], found)
             return
-        finding = _finding(found)
+        if "refused" in found:
+            refused = found["refused"]
+            raise REFUSALS.get(refused["kind"], ConfigError)(
+                refused["message"], **{key: refused.get(key) for key in ("where", "allowed", "hint")}
+            )
+        finding = Finding(**found)
         yield finding
         if number == 0 and finding.outcome == "fail":
             yield from _not_reached(statements[1:])
@@ -136,25 +145,14 @@ def _next_finding(child: Child, seconds: float, *, loading: bool) -> dict[str, A
         allowed = OVERTIME * seconds if called else START_SECONDS + OVERTIME * seconds
 
 
-def _finding(found: dict[str, Any]) -> Finding:
-    """The finding of a line; raises the error of a refused configuration."""
-    if "refused" not in found:
-        return Finding(**found)
-    told = found["refused"]
-    raise REFUSALS.get(told["kind"], ConfigError)(
-        told["message"], **{key: told.get(key) for key in ("where", "allowed", "hint")}
-    )
-
-
 def _all_lost(statements: Statements, reason: str) -> Iterator[Finding]:
     """A failure of the first law, and findings that later laws were not reached."""
     yield Finding(*statements[0], "fail", reason)
     yield from _not_reached(statements[1:])
 
 
-def _not_reached(statements: Statements) -> Iterator[Finding]:
-    for one in statements:
-        yield Finding(*one, "skip", "not reached")
+def _not_reached(statements: Statements) -> list[Finding]:
+    return [Finding(*one, "skip", "not reached") for one in statements]
 
 
 def statements_of(noun: str) -> Statements:
@@ -196,8 +194,8 @@ def _begin(request: dict[str, Any], result: BinaryIO) -> Contract | None:
     from lidardesign.contract.contract import Contract
 
     version = f"version {plugin.api_version} of the {request['noun']} interface"
-    loaded = Finding(*LOADS, "pass", f"{version}, {type(plugin).__module__}", time.perf_counter() - started)
-    write_line(result, loaded.as_dict())
+    passed = f"{version}, {type(plugin).__module__}"
+    write_line(result, Finding(*LOADS, "pass", passed, time.perf_counter() - started).as_dict())
     return Contract(subject)
 
 

@@ -6,6 +6,7 @@ Scenes are reproducible, splits share none, and scenes can be sent to other proc
 from __future__ import annotations
 
 import importlib
+import itertools
 import json
 import math
 import os
@@ -227,16 +228,18 @@ def check_metric(subject: Subject) -> LawHolds:
         "worst": not _is_finite(metric.worst),
         "tolerance": not _is_finite(metric.tolerance) or metric.tolerance <= 0,
     }
-    for name, is_wrong in wrong.items():
-        if is_wrong:
-            raise BrokenLawError(
-                f"metric.{name} is {getattr(metric, name)!r}",
-                allowed="a name, a unit, better='lower' or 'higher', a finite worst value, a tolerance above 0",
-            )
+    allowed = "a name, a unit, better='lower' or 'higher', a finite worst value, a tolerance above 0"
+    _refuse_wrong("metric", metric, wrong, allowed)
     return LawHolds(
         f"{metric.name} [{metric.unit}], {metric.better} is better, worst {metric.worst:g}",
         {"worst": float(metric.worst), "tolerance": float(metric.tolerance)},
     )
+
+
+def _refuse_wrong(kind: str, holder: object, wrong: dict[str, bool], allowed: str) -> None:
+    """Name the first member of an object that is wrong, if there is one."""
+    for name in itertools.compress(wrong, wrong.values()):
+        raise BrokenLawError(f"{kind}.{name} is {getattr(holder, name)!r}", allowed=allowed)
 
 
 def _is_finite(value: object) -> bool:
@@ -246,14 +249,11 @@ def _is_finite(value: object) -> bool:
 def check_defaults(subject: Subject) -> LawHolds:
     """Suggested rays, level and settings are valid in every preset."""
     defaults = subject.task.defaults
-    allowed = "rays of 1 or more, a level between 0 and 1"
     wrong = {
         "rays": not (isinstance(defaults.rays, list | tuple) and defaults.rays and all(map(_is_count, defaults.rays))),
         "level": not _is_finite(defaults.level) or not 0 < defaults.level < 1,
     }
-    for name, is_wrong in wrong.items():
-        if is_wrong:
-            raise BrokenLawError(f"defaults.{name} is {getattr(defaults, name)!r}", allowed=allowed)
+    _refuse_wrong("defaults", defaults, wrong, "rays of 1 or more, a level between 0 and 1")
     unknown = [preset for preset in defaults.learning if preset not in PRESETS]
     if unknown:
         raise BrokenLawError(f"defaults.learning has the preset {unknown[0]!r}", allowed=", ".join(PRESETS))

@@ -57,9 +57,8 @@ def check_number(subject: Subject) -> LawHolds:
         anywhere = [full_rays(space.at(one).sample(DENSE, generator), space) for one in subject.conditions]
         for lists in (subject.rays(number, DENSE), subject.rays(number, SPARSE), anywhere):
             values.append(subject.score(scene, subject.returns(number, lists)).value)
-    unit = subject.metric.unit
     return LawHolds(
-        f"{len(values)} scores from {min(values):.4g} to {max(values):.4g} {unit}",
+        f"{len(values)} scores from {min(values):.4g} to {max(values):.4g} {subject.metric.unit}",
         {"least": min(values), "most": max(values)},
     )
 
@@ -88,15 +87,12 @@ def check_nothing(subject: Subject) -> LawHolds:
 
 def check_best(subject: Subject) -> LawHolds:
     """Many exact returns from targets score at least as well as few, and better than none."""
-    dense, sparse, none = [], [], []
+    scores = []
     for number, scene in enumerate(subject.looked_at):
-        returns = _dense(subject, number)
-        dense.append(subject.score(scene, returns).value)
-        sparse.append(subject.score(scene, subject.returns(number, subject.rays(number, SPARSE))).value)
-        none.append(subject.score(scene, without_returns(returns)).value)
-    best, few, nothing = (float(np.mean(values)) for values in (dense, sparse, none))
+        dense, sparse = _dense(subject, number), subject.returns(number, subject.rays(number, SPARSE))
+        scores.append([subject.score(scene, one).value for one in (dense, sparse, without_returns(dense))])
+    best, few, nothing = np.mean(scores, axis=0).tolist()
     metric = subject.metric
-    figures = {"dense": best, "sparse": few, "none": nothing}
     said = f"{best:.4g} of {DENSE} rays at targets, {few:.4g} of {SPARSE}, {nothing:.4g} of none [{metric.unit}]"
     if _worse(subject, best, few) > metric.tolerance or not _worse(subject, nothing, best) > 0:
         raise BrokenLawError(
@@ -104,7 +100,7 @@ def check_best(subject: Subject) -> LawHolds:
             allowed=f"the first is the best ({metric.better} is better)",
             hint="check metric.better and what score() compares",
         )
-    return LawHolds(said, figures)
+    return LawHolds(said, {"dense": best, "sparse": few, "none": nothing})
 
 
 def check_order(subject: Subject) -> LawHolds | NotApplicable:
@@ -119,8 +115,9 @@ def check_order(subject: Subject) -> LawHolds | NotApplicable:
         worst = max(worst, abs(other - value))
     limit = ORDER_SHARE * subject.metric.tolerance
     if worst > limit:
-        unit = subject.metric.unit
-        raise BrokenLawError(f"rays in another order change the score by {worst:.3g} {unit}", allowed=f"{limit:.3g}")
+        raise BrokenLawError(
+            f"rays in another order change the score by {worst:.3g} {subject.metric.unit}", allowed=f"{limit:.3g}"
+        )
     return LawHolds(f"changes by at most {worst:.1g} {subject.metric.unit}", {"difference": worst})
 
 
