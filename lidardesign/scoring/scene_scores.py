@@ -82,8 +82,7 @@ def score_lists(
                 repeats=[number for positions in group for number in _repeats(positions)],
             )
         )
-        rays = sum(_count(positions) for positions in group)
-        per_ray = (time.perf_counter() - started) / max(rays, 1)
+        per_ray = (time.perf_counter() - started) / max(sum(map(_count, group)), 1)
         for positions in group:
             returns = returns_of(positions, scene, [next(found) for _ in positions])
             started = time.perf_counter()
@@ -458,8 +457,9 @@ class TrainingScorer:
         physics = self._physics(number, planned or lists, casters)
         plan = self.plans.get(0) if self._plans_once else None
         prepared = None if self._preparation is None else self._preparation.of(lists, plan)
-        found = score_lists(self.task, self.metric, scene, lists, casters, physics, prepared)
-        return [score.value for score, _ in found]
+        return [
+            score.value for score, _ in score_lists(self.task, self.metric, scene, lists, casters, physics, prepared)
+        ]
 
     def _physics(self, number: int, lists: Sequence[Positions], casters: Sequence[SceneCaster]) -> Physics | None:
         """The effects that a scene calls for, which sets of rays say where they are the first."""

@@ -268,9 +268,9 @@ def check_windows(windows_m: np.ndarray, detector: Detector) -> None:
             )
         if detector.histogram_start == "pulse" and wide[:, 1].max() > reach * (1 + SLACK):
             low, high = wide[np.argmax(wide[:, 1])]
-            inside = "starts outside" if low >= reach else "ends outside"
             raise ConfigError(
-                f"a gate from {low:.4g} to {high:.4g} m {inside} the histogram, which starts with the pulse",
+                f"a gate from {low:.4g} to {high:.4g} m {'starts' if low >= reach else 'ends'} outside the histogram, "
+                "which starts with the pulse",
                 where=where,
                 allowed=what,
                 hint=_NARROWER,

@@ -298,8 +298,7 @@ def render_transient(
     parts = []
     for number, rows in enumerate(_chunks(count, bins.count)):
         mine = arrays | {name: values[rows] for name, values in by_ray.items()}
-        own_seed = int(np.random.SeedSequence([seed, number]).generate_state(1)[0])
-        found = ask({**request, "seed": own_seed}, mine)
+        found = ask({**request, "seed": int(np.random.SeedSequence([seed, number]).generate_state(1)[0])}, mine)
         parts.append({**found, "ray": found["ray"] + rows[0]})
     ray, cell, radiance, steady = (
         np.concatenate([part[name] for part in parts]) for name in ("ray", "cell", "radiance", "steady")
