@@ -221,8 +221,12 @@ def seen_in_file(scene: Scene, design: DesignSpec, count: int, measuring: Measur
 def _seen(design: DesignSpec, scene: Scene, positions: Positions, planner: Planner, seed: int) -> SeenScene:
     casters = build_casters(scene)
     plan = planner.plan(scene, list(positions), casters)
-    found = returns_in_scene(scene, positions, casters, planner.physics(plan, seed))
-    return SeenScene(design, scene, found, tuple(sorted(plan.effects)))
+    return SeenScene(
+        design,
+        scene,
+        returns_in_scene(scene, positions, casters, planner.physics(plan, seed)),
+        tuple(sorted(plan.effects)),
+    )
 
 
 def scene_of_file(path: Path, mount: str | None, scale: float = 1.0) -> Scene:

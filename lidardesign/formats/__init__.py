@@ -77,13 +77,25 @@ def check_format(name: str, found: Any) -> dict[str, Any]:
     Raises:
         PluginError: The first member that is missing or of the wrong type or value.
     """
-    texts = dict.fromkeys(("name", "summary", "suffix", "reader", "checked"), str)
-    check_members("format", name, found, API_VERSION, **texts, holds=frozenset, is_folder=bool, write=object)
+    check_members(
+        "format",
+        name,
+        found,
+        API_VERSION,
+        **dict.fromkeys(("name", "summary", "suffix", "reader", "checked"), str),
+        holds=frozenset,
+        is_folder=bool,
+        write=object,
+    )
     unknown = sorted(map(str, found.holds.difference(HELD)))
     if unknown or not found.suffix.startswith(".") or "/" in found.suffix:
         wrong = f"holds {', '.join(unknown)}" if unknown else f"its suffix is {found.suffix!r}"
-        allowed = ", ".join(HELD) if unknown else "a dot, then a name"
-        raise PluginError(wrong, where=f"format {name}", allowed=allowed, hint=AUTHOR_HINT)
+        raise PluginError(
+            wrong,
+            where=f"format {name}",
+            allowed=", ".join(HELD) if unknown else "a dot, then a name",
+            hint=AUTHOR_HINT,
+        )
     facts = {key: getattr(found, key) for key in ("summary", "suffix", "reader", "checked")}
     return {
         **facts,

@@ -128,9 +128,9 @@ def origin_losses(mounted: Sequence[Mount]) -> list[str]:
     spread = [one for one in mounted if one.spread_m > SAME_M]
     if not spread:
         return []
-    rays, worst = sum(len(one.ray) for one in spread), max(one.spread_m for one in spread)
     return [
-        f"{rays} rays of {len(spread)} sensors start beside their sensor's middle: moved there, by up to {worst:.3g} m"
+        f"{sum(len(one.ray) for one in spread)} rays of {len(spread)} sensors start beside their sensor's middle: "
+        f"moved there, by up to {max(one.spread_m for one in spread):.3g} m"
     ]
 
 
@@ -139,10 +139,9 @@ def gate_losses(mounted: Sequence[Mount]) -> list[str]:
     wider = [one for one in mounted if one.gate_excess_m > SAME_M]
     if not wider:
         return []
-    worst = max(one.gate_excess_m for one in wider)
     return [
         f"the rays of {len(wider)} of {len(mounted)} sensors have gates of their own: the sensor's is the narrowest "
-        f"that holds them all, up to {worst:.3g} m wider"
+        f"that holds them all, up to {max(one.gate_excess_m for one in wider):.3g} m wider"
     ]
 
 
@@ -221,9 +220,10 @@ class EvenGrid:
 
     def directions(self) -> np.ndarray:
         """Unit vectors row by row upwards, each row by growing azimuth, shape (rows * columns, 3)."""
-        azimuth = np.linspace(*self.azimuth_rad, self.columns)
-        elevation = np.linspace(*self.elevation_rad, self.rows)
-        return direction(np.tile(azimuth, self.rows), np.repeat(elevation, self.columns))
+        return direction(
+            np.tile(np.linspace(*self.azimuth_rad, self.columns), self.rows),
+            np.repeat(np.linspace(*self.elevation_rad, self.rows), self.columns),
+        )
 
     def distance_rad(self, azimuth_rad: np.ndarray, elevation_rad: np.ndarray) -> np.ndarray:
         """Angle between rays and the grid rays of their cells, shape (N,) [rad]."""

@@ -359,8 +359,11 @@ def read_sensor_csv(path: Path) -> DesignSpec:
     if abs(total - 1) > WEIGHT_SUM_TOLERANCE:
         notes.append(f"weights summed to {total:.6g} and were normalised")
         sensors = [replace(sensor, weight=sensor.weight / total) for sensor in sensors]
-    provenance = {"source": path.name, "format": "sensor CSV of the research code", "notes": notes}
-    return DesignSpec(name=path.stem, sensors=tuple(sensors), provenance=provenance)
+    return DesignSpec(
+        name=path.stem,
+        sensors=tuple(sensors),
+        provenance={"source": path.name, "format": "sensor CSV of the research code", "notes": notes},
+    )
 
 
 def _rows(path: Path) -> tuple[list[tuple[dict[str, float], str]], list[str]]:

@@ -190,10 +190,17 @@ def _sites(places_m: np.ndarray, directions: np.ndarray, names: np.ndarray) -> l
 
 def _rangefinder(site: str, rays: Rays, ray: int, rate_hz: float) -> Element:
     start, end = rays.gate_m[ray]
-    user = numbers([start, end, rays.sensor[ray], rays.time_s[ray]])
     # a cutoff of 0 means none; without a number of samples MuJoCo ignores the interval
-    rate = {"nsample": "1", "interval": 1 / rate_hz} if rate_hz else {}
-    return element("rangefinder", {"name": site, "site": site, "cutoff": max(end, SLACK), "user": user, **rate})
+    return element(
+        "rangefinder",
+        {
+            "name": site,
+            "site": site,
+            "cutoff": max(end, SLACK),
+            "user": numbers([start, end, rays.sensor[ray], rays.time_s[ray]]),
+            **({"nsample": "1", "interval": 1 / rate_hz} if rate_hz else {}),
+        },
+    )
 
 
 LINK = "lidar"

@@ -112,29 +112,30 @@ def _blueprint(mount: Mount, rate_hz: float) -> dict[str, Any]:
     step_rad = (grid.azimuth_rad[1] - grid.azimuth_rad[0]) / max(grid.columns - 1, 1)
     turn_hz, field_deg = _sweep(max(math.degrees(step_rad) * grid.columns, NARROWEST_DEG), rate_hz)
     low_deg, high_deg = (math.degrees(value) for value in grid.elevation_rad)
-    attributes = {
-        "channels": str(grid.rows),
-        "range": repr(mount.gate_m[1]),
-        "points_per_second": str(round(len(grid) * rate_hz)),
-        "rotation_frequency": repr(turn_hz),
-        "upper_fov": repr(high_deg),
-        "lower_fov": repr(low_deg),
-        "horizontal_fov": repr(field_deg),
-        # a design has no noise: every hit is reported, at its exact range
-        "dropoff_general_rate": "0.0",
-        "dropoff_zero_intensity": "0.0",
-        "noise_stddev": "0.0",
-        # at every frame: an interval of the same length leaves frames out by its rounding
-        "sensor_tick": "0.0",
-        "role_name": mount.name,
-    }
-    location = dict(zip("xyz", (MIRROR @ mount.origin_m).tolist(), strict=True))
     return {
         "id": mount.name,
         "name": mount.sensor.name,
         "type": "sensor.lidar.ray_cast",
-        "attributes": attributes,
-        "transform": {"location": location, "rotation": _rotation(mount, grid, field_deg)},
+        "attributes": {
+            "channels": str(grid.rows),
+            "range": repr(mount.gate_m[1]),
+            "points_per_second": str(round(len(grid) * rate_hz)),
+            "rotation_frequency": repr(turn_hz),
+            "upper_fov": repr(high_deg),
+            "lower_fov": repr(low_deg),
+            "horizontal_fov": repr(field_deg),
+            # a design has no noise: every hit is reported, at its exact range
+            "dropoff_general_rate": "0.0",
+            "dropoff_zero_intensity": "0.0",
+            "noise_stddev": "0.0",
+            # at every frame: an interval of the same length leaves frames out by its rounding
+            "sensor_tick": "0.0",
+            "role_name": mount.name,
+        },
+        "transform": {
+            "location": _vector(MIRROR @ mount.origin_m),
+            "rotation": _rotation(mount, grid, field_deg),
+        },
     }
 
 
