@@ -325,8 +325,11 @@ def _check_references(item: Any, count: int, place: str, where: str) -> None:
 
 
 def _check_accessors(document: dict[str, Any], where: str) -> None:
-    views = document.get("bufferViews") or ()
-    copied = sum(view["byteLength"] for view in views if isinstance(view, dict) and "byteLength" in view)
+    copied = sum(
+        view["byteLength"]
+        for view in document.get("bufferViews") or ()
+        if isinstance(view, dict) and "byteLength" in view
+    )
     for number, accessor in enumerate(document.get("accessors") or ()):
         place = f"accessors[{number}]"
         if not isinstance(accessor, dict) or accessor.get("type") not in COMPONENTS or "count" not in accessor:

@@ -369,16 +369,14 @@ def prepare_for(
     seed: int,
     planner: Planner | None,
 ) -> Any:
-    """What a task prepares for one set of rays, with the plan of each scene; the rest as of `Preparation`."""
+    """What a task prepares for one set of rays, as another process gets it: scores by workers are the same.
+
+    Arguments are the plan of each scene, and the rest as of `Preparation`.
+    """
     returns = []
     for scene, plan in zip(scenes, plans, strict=True):
         physics = planner.physics(plan, seed) if planner and plan else None
         returns.append(returns_in_scene(scene, positions, build_casters(scene), physics))
-    return _checked_preparation(task, scenes, returns, seed)
-
-
-def _checked_preparation(task: Task, scenes: Sequence[Scene], returns: Sequence[Sequence[Returns]], seed: int) -> Any:
-    """What a task prepares from returns, as another process gets it: scores by workers are the same."""
     where = f"task {task.name}"
     with called_on(task, "prepare", where, scenes):
         made = task.prepare(scenes, returns, seed)
@@ -470,7 +468,9 @@ class TrainingScorer:
             plan = self.planner.plan(self._drawn[number], [rays for one in lists for rays in one], casters)
             if self._plans_once:
                 # the bound is kept
-                kept = (replace(one, on=one.on and one.name != "multipath") for one in plan.decisions)
-                plan = replace(plan, decisions=tuple(kept))
+                plan = replace(
+                    plan,
+                    decisions=tuple(replace(one, on=one.on and one.name != "multipath") for one in plan.decisions),
+                )
             self.plans[planned] = plan
         return self.planner.physics(self.plans[planned], self.seed)

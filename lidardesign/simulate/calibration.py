@@ -155,9 +155,11 @@ def light_notes(design: DesignSpec, detector: Detector) -> list[str]:
         return []
     known = [name for name, part in kinds.items() if part_light(part, detector, part.rays) is not None]
     unknown = [name for name in kinds if name not in known]
-    lines = [f"light as data sheets imply: {', '.join(known)}"] * bool(known)
-    own = f"no stated range sets the light of {', '.join(unknown)}: that of {detector.name} is used"
-    return [*lines, *[own] * bool(unknown)]
+    lines = {
+        f"light as data sheets imply: {', '.join(known)}": known,
+        f"no stated range sets the light of {', '.join(unknown)}: that of {detector.name} is used": unknown,
+    }
+    return [line for line, names in lines.items() if names]
 
 
 @dataclass(frozen=True)

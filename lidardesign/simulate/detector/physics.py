@@ -351,8 +351,7 @@ class Physics:
 
     def stream(self, effect: str, scene: Scene, frame: int) -> int:
         """Key of an effect's random numbers in a frame of a scene, independent of other effects."""
-        again = (str(self.repeat),) if self.repeat else ()
-        label = "\0".join((str(self.seed), effect, scene.name, str(frame), *again))
+        label = "\0".join(map(str, (self.seed, effect, scene.name, frame, *([self.repeat] if self.repeat else []))))
         return int.from_bytes(hashlib.sha256(label.encode()).digest()[:8], "little")
 
 

@@ -165,8 +165,12 @@ class Lights:
         """A fixed receiver as a light, by reciprocity: 1 W/sr within its field of view."""
         axes = receiver_axes(receiver)
         made = cls.everywhere(np.asarray(receiver.origin_m)[None], axes[:1], 1.0)
-        tangents = np.tan([[receiver.horizontal_rad / 2, receiver.vertical_rad / 2]])
-        return replace(made, axes=axes[None], least_cosine=np.zeros(1), tangents=tangents)
+        return replace(
+            made,
+            axes=axes[None],
+            least_cosine=np.zeros(1),
+            tangents=np.tan([[receiver.horizontal_rad / 2, receiver.vertical_rad / 2]]),
+        )
 
     @classmethod
     def everywhere(cls, origin_m: np.ndarray, forward: np.ndarray, intensity: float) -> Lights:
