@@ -51,11 +51,8 @@ def write_clouds(seen: Sequence[SeenScene], path: Path, form: str) -> list[str]:
 
 def _ply(cloud: np.ndarray) -> bytes:
     # CloudCompare reads properties with this prefix as scalar fields, named without it
-    names = [name if name in "xyz" else f"scalar_{name}" for name, _ in COLUMNS]
-    renamed = np.zeros(len(cloud), dtype=list(zip(names, (kind for _, kind in COLUMNS), strict=True)))
-    for name, (own, _) in zip(names, COLUMNS, strict=True):
-        renamed[name] = cloud[own]
-    return ply_file([f"comment outcome {OUTCOMES}"], vertex=renamed)
+    kinds = [(name if name in "xyz" else f"scalar_{name}", kind) for name, kind in COLUMNS]
+    return ply_file([f"comment outcome {OUTCOMES}"], vertex=cloud.view(kinds))
 
 
 def _pcd(cloud: np.ndarray) -> bytes:
@@ -71,9 +68,7 @@ def _pcd(cloud: np.ndarray) -> bytes:
 
 
 def _surface(vertices: np.ndarray, faces: np.ndarray) -> bytes:
-    points = np.zeros(len(vertices), dtype=[("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
-    for name, column in zip("xyz", vertices.T, strict=True):
-        points[name] = column
+    points = np.rec.fromarrays(vertices.T, dtype=[("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
     table = np.zeros(len(faces), dtype=FACES)
     table["corners"], table["vertex_indices"] = 3, faces
     return ply_file(["comment target surface that no sensor sees"], vertex=points, face=table)
@@ -83,8 +78,9 @@ def _mcap(seen: Sequence[SeenScene]) -> bytes:
     """All frames one after the other, each a frame's time after the one before."""
     design = seen[0].design
     parent = design.mount or WORLD
-    mounted = mounted_parts(design)
-    frames = [(f"{one.name}_link", one.sensor.origin_m, quaternion(*one.roll_pitch_yaw_rad)) for one in mounted]
+    frames = [
+        (f"{one.name}_link", one.sensor.origin_m, quaternion(*one.roll_pitch_yaw_rad)) for one in mounted_parts(design)
+    ]
     clouds, time_ns = [], 0
     for one in seen:
         for entry in range(len(one.returns)):

@@ -122,8 +122,11 @@ def mcap_content(clouds: Sequence[tuple[int, bytes]], transforms: bytes) -> byte
     try:
         from mcap.writer import CompressionType, Writer
     except ImportError:
-        hint = "pip install 'lidardesign[mcap]', or --format ply"
-        raise ConfigError("the library mcap is not installed", where="--format mcap", hint=hint) from None
+        raise ConfigError(
+            "the library mcap is not installed",
+            where="--format mcap",
+            hint="pip install 'lidardesign[mcap]', or --format ply",
+        ) from None
     file = BytesIO()
     # without compression the same messages are the same bytes with every version of the libraries
     writer = Writer(file, compression=CompressionType.NONE)
@@ -134,8 +137,11 @@ def mcap_content(clouds: Sequence[tuple[int, bytes]], transforms: bytes) -> byte
         ("/tf_static", "tf2_msgs/msg/TFMessage", TRANSFORMS, 1, TRANSIENT_LOCAL),
     ):
         schema = writer.register_schema(name=name, encoding="ros2msg", data=text.encode())
-        metadata = {"offered_qos_profiles": QOS.format(depth=depth, durability=durability)}
-        channels.append(writer.register_channel(topic, "cdr", schema, metadata))
+        channels.append(
+            writer.register_channel(
+                topic, "cdr", schema, {"offered_qos_profiles": QOS.format(depth=depth, durability=durability)}
+            )
+        )
     writer.add_message(channels[1], log_time=0, publish_time=0, data=transforms)
     for time_ns, data in clouds:
         writer.add_message(channels[0], log_time=time_ns, publish_time=time_ns, data=data)

@@ -221,8 +221,12 @@ def seen_in_file(scene: Scene, design: DesignSpec, count: int, measuring: Measur
 def _seen(design: DesignSpec, scene: Scene, positions: Positions, planner: Planner, seed: int) -> SeenScene:
     casters = build_casters(scene)
     plan = planner.plan(scene, list(positions), casters)
-    found = returns_in_scene(scene, positions, casters, planner.physics(plan, seed))
-    return SeenScene(design, scene, found, tuple(sorted(plan.effects)))
+    return SeenScene(
+        design,
+        scene,
+        returns_in_scene(scene, positions, casters, planner.physics(plan, seed)),
+        tuple(sorted(plan.effects)),
+    )
 
 
 def scene_of_file(path: Path, mount: str | None, scale: float = 1.0) -> Scene:
@@ -251,7 +255,10 @@ def scene_of_file(path: Path, mount: str | None, scale: float = 1.0) -> Scene:
     if mount is not None:
         names = [model.body(number).name for number in range(model.nbody)]
         if mount not in names:
-            allowed = ", ".join(filter(None, names))
-            raise DataError(f"has no body {mount!r}, which the design is mounted on", where=str(path), allowed=allowed)
+            raise DataError(
+                f"has no body {mount!r}, which the design is mounted on",
+                where=str(path),
+                allowed=", ".join(filter(None, names)),
+            )
         poses = inverse_rigid(poses[:, names.index(mount)])[:, None] @ poses
     return Scene(tuple(geom.at(poses) for geom in visible_geoms(model)[0]), path.stem)

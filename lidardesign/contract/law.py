@@ -398,8 +398,13 @@ def shuffled(returns: Sequence[Returns], generator: np.random.Generator) -> list
 
 def returns_of_rays(returns: Returns, chosen: np.ndarray) -> Returns:
     """The returns of the rays at an index or mask."""
-    columns = (returns.outcome[chosen], returns.range_m[chosen], returns.body[chosen])
-    return Returns(returns.rays.subset(chosen), *columns, returns.frame)
+    return Returns(
+        returns.rays.subset(chosen),
+        returns.outcome[chosen],
+        returns.range_m[chosen],
+        returns.body[chosen],
+        returns.frame,
+    )
 
 
 def without_returns(returns: Sequence[Returns]) -> list[Returns]:

@@ -70,8 +70,11 @@ def ball_scenes(seed: int) -> list[Scene]:
 def ball_world(space: DesignSpace) -> World:
     """A world of balls before a design space."""
     task: Any = BallTask()
-    config = SimpleNamespace(density=SimpleNamespace(sigma_m=0.01))
-    run: Any = SimpleNamespace(task=task, config=config, scenes=lambda split, seed: ball_scenes(seed))
+    run: Any = SimpleNamespace(
+        task=task,
+        config=SimpleNamespace(density=SimpleNamespace(sigma_m=0.01)),
+        scenes=lambda split, seed: ball_scenes(seed),
+    )
     return World(task, None, space, SEED, ball_scenes(SEED), TrainingScenes(run, SEED), Planner())
 
 

@@ -81,17 +81,20 @@ def check_in_process(request: CheckRequest) -> Iterator[Finding]:
         yield from _all_lost(statements, error_words(error))
         return
     with tempfile.TemporaryDirectory(prefix="lidardesign-check-") as folder:
-        document = {
-            "folder": folder,
-            "noun": request.noun,
-            "name": offer.name,
-            "value": offer.value,
-            "config_file": str(request.config_file) if request.config_file else None,
-            "overrides": list(request.overrides),
-            "seed": request.seed,
-            "seconds": request.limit_s,
-        }
-        child = Child(f"{__name__}:answer_check", document, {PROBING: "1"})
+        child = Child(
+            f"{__name__}:answer_check",
+            {
+                "folder": folder,
+                "noun": request.noun,
+                "name": offer.name,
+                "value": offer.value,
+                "config_file": str(request.config_file) if request.config_file else None,
+                "overrides": list(request.overrides),
+                "seed": request.seed,
+                "seconds": request.limit_s,
+            },
+            {PROBING: "1"},
+        )
         try:
             yield from _read_findings(child, request.limit_s, statements)
         finally:
@@ -193,8 +196,7 @@ def _begin(request: dict[str, Any], result: BinaryIO) -> Contract | None:
     # imported late: a plugin that fails to load is reported without the libraries that the laws need
     from lidardesign.contract.contract import Contract
 
-    version = f"version {plugin.api_version} of the {request['noun']} interface"
-    passed = f"{version}, {type(plugin).__module__}"
+    passed = f"version {plugin.api_version} of the {request['noun']} interface, {type(plugin).__module__}"
     write_line(result, Finding(*LOADS, "pass", passed, time.perf_counter() - started).as_dict())
     return Contract(subject)
 

@@ -136,8 +136,13 @@ def fingerprints_in_process(config: RunConfig, kind: type, seconds: float) -> di
     }
     hash_seed = next(seed for seed in HASH_SEEDS if seed != os.environ.get("PYTHONHASHSEED"))
     try:
-        limit_s, work = len(SPLITS) * seconds, f"{__name__}:answer_fingerprints"
-        found = ask(work, request, limit_s, "there", {"PYTHONHASHSEED": hash_seed})
+        found = ask(
+            f"{__name__}:answer_fingerprints",
+            request,
+            len(SPLITS) * seconds,
+            "there",
+            {"PYTHONHASHSEED": hash_seed},
+        )
     except ChildError as lost:
         raise BrokenLawError(f"scenes failed in another process, which {lost}") from None
     if "error" in found:
@@ -266,8 +271,7 @@ def check_defaults(subject: Subject) -> LawHolds:
                 resolve(subject.task, preset=preset, overrides=task)
         except ConfigError as error:
             raise BrokenLawError(f"preset {preset}: {error.message}", allowed=error.allowed) from error
-    rays = ", ".join(map(str, defaults.rays))
-    return LawHolds(f"level {defaults.level:g}, evaluated at {rays} rays")
+    return LawHolds(f"level {defaults.level:g}, evaluated at {', '.join(map(str, defaults.rays))} rays")
 
 
 def _is_count(value: object) -> bool:

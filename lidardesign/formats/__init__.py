@@ -77,16 +77,32 @@ def check_format(name: str, found: Any) -> dict[str, Any]:
     Raises:
         PluginError: The first member that is missing or of the wrong type or value.
     """
-    texts = dict.fromkeys(("name", "summary", "suffix", "reader", "checked"), str)
-    check_members("format", name, found, API_VERSION, **texts, holds=frozenset, is_folder=bool, write=object)
+    check_members(
+        "format",
+        name,
+        found,
+        API_VERSION,
+        **dict.fromkeys(("name", "summary", "suffix", "reader", "checked"), str),
+        holds=frozenset,
+        is_folder=bool,
+        write=object,
+    )
     unknown = sorted(map(str, found.holds.difference(HELD)))
     if unknown or not found.suffix.startswith(".") or "/" in found.suffix:
         wrong = f"holds {', '.join(unknown)}" if unknown else f"its suffix is {found.suffix!r}"
-        allowed = ", ".join(HELD) if unknown else "a dot, then a name"
-        raise PluginError(wrong, where=f"format {name}", allowed=allowed, hint=AUTHOR_HINT)
+        raise PluginError(
+            wrong,
+            where=f"format {name}",
+            allowed=", ".join(HELD) if unknown else "a dot, then a name",
+            hint=AUTHOR_HINT,
+        )
     facts = {key: getattr(found, key) for key in ("summary", "suffix", "reader", "checked")}
-    reads = getattr(found, "read", None) is not None
-    return {**facts, "folder": found.is_folder, "holds": sorted(found.holds), "reads": reads}
+    return {
+        **facts,
+        "folder": found.is_folder,
+        "holds": sorted(found.holds),
+        "reads": getattr(found, "read", None) is not None,
+    }
 
 
 FORMATS: PluginKind[Format] = PluginKind("lidardesign.formats", "format", check_format)
@@ -148,8 +164,9 @@ def _write_contained(format: Format, design: DesignSpec, rays: Rays, path: Path,
         with plugin_guard(format.name, "format"):
             notes = [str(note) for note in format.write(design, rays, staged, options)]
         if not (staged.is_dir() if format.is_folder else staged.is_file()):
-            found = f"wrote no {'folder' if format.is_folder else 'file'}"
-            raise PluginError(found, where=f"format {format.name}", hint=AUTHOR_HINT)
+            raise PluginError(
+                f"wrote no {'folder' if format.is_folder else 'file'}", where=f"format {format.name}", hint=AUTHOR_HINT
+            )
         if format.is_folder:
             return [*write_folder(path, folder_contents(staged)), *notes]
         write_atomic(path, staged.read_bytes())

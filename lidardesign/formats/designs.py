@@ -116,8 +116,12 @@ def read_rig(path: Path, head: bytes) -> Rig | None:
     if head.removeprefix(codecs.BOM_UTF8).lstrip().startswith(XML_BEGINNINGS):
         tag = read_xml(path, ALLOWED[XML]).tag
         if tag not in XML_ROOTS:
-            found, hint = f"its root element is {f'<{tag[:40]}>'!r}", OTHER_ROOTS.get(tag)
-            raise DataError(found, where=str(path), allowed=ALLOWED[XML], hint=hint)
+            raise DataError(
+                f"its root element is {f'<{tag[:40]}>'!r}",
+                where=str(path),
+                allowed=ALLOWED[XML],
+                hint=OTHER_ROOTS.get(tag),
+            )
         return XML_ROOTS[tag](path)
     lines = head.decode("utf-8-sig", errors="replace").splitlines()
     texts = [(number, line) for number, line in enumerate(lines, 1) if line.strip()]
@@ -155,8 +159,12 @@ def _check_bytes(path: Path, head: bytes) -> None:
         is_text = kind == XML and head.startswith(UTF16_MARKS)
     if not is_text:
         found = {CSV: "is not UTF-8 text", NPZ: "is not an NPZ archive", XML: "is not XML"}[kind]
-        hint = "save it as UTF-8" if kind == CSV else None
-        raise DataError(f"{found}, or is damaged", where=str(path), allowed=ALLOWED[kind], hint=hint)
+        raise DataError(
+            f"{found}, or is damaged",
+            where=str(path),
+            allowed=ALLOWED[kind],
+            hint="save it as UTF-8" if kind == CSV else None,
+        )
 
 
 def _check_text(path: Path, texts: list[tuple[int, str]]) -> None:
@@ -181,8 +189,12 @@ def _check_text(path: Path, texts: list[tuple[int, str]]) -> None:
 
 
 def _wrong_separator(separator: str, where: str) -> DataError:
-    found, hint = f"columns are separated by {SEPARATORS[separator]}", "save it with commas, and with points in numbers"
-    return DataError(found, where=where, allowed=ALLOWED[CSV], hint=hint)
+    return DataError(
+        f"columns are separated by {SEPARATORS[separator]}",
+        where=where,
+        allowed=ALLOWED[CSV],
+        hint="save it with commas, and with points in numbers",
+    )
 
 
 def read_design(path: Path, notes: Notes = log_note, reach_m: float | None = None) -> DesignSpec:
@@ -205,8 +217,12 @@ def read_design(path: Path, notes: Notes = log_note, reach_m: float | None = Non
     except (ConfigError, DataError) as error:
         if difference is None:
             raise
-        hint = f"the file {difference}; fit it again, or correct it"
-        raise type(error)(error.message, where=error.where, allowed=error.allowed, hint=hint) from None
+        raise type(error)(
+            error.message,
+            where=error.where,
+            allowed=error.allowed,
+            hint=f"the file {difference}; fit it again, or correct it",
+        ) from None
     if difference is not None:
         notes(f"{path} {difference}")
     kept = tuple(one for one in design.certificates if digested(one, design) == one)

@@ -178,8 +178,11 @@ def write_galvo(design: DesignSpec, rays: Rays, path: Path, _: object = None) ->
             row = (len(lines) - 1, number, *shared, repr(x), repr(y), start, width, int(rays.sensor[ray]), ray)
             lines.append(",".join(map(str, row)))
     write_atomic(path, "\n".join(lines) + "\n")
-    rounded = "gates are whole picoseconds (0.15 mm), opened outward; firing times follow from the order of the rows"
-    return [*_summary(positions), *LOST, rounded]
+    return [
+        *_summary(positions),
+        *LOST,
+        "gates are whole picoseconds (0.15 mm), opened outward; firing times follow from the order of the rows",
+    ]
 
 
 GALVO = Format(
@@ -297,9 +300,7 @@ def _columns(path: Path) -> dict[str, np.ndarray]:
     (_, header), *rows = csv_rows(path, RAY_TABLE) or [(1, [])]
     if tuple(header) != COLUMNS:
         raise DataError("is not a ray list of the galvo format", where=where, allowed=",".join(COLUMNS))
-    values = np.empty((len(rows), len(COLUMNS)))
-    for index, (line, row) in enumerate(rows):
-        values[index] = _numbers(row, f"{where}:{line}")
+    values = np.array([_numbers(row, f"{where}:{line}") for line, row in rows]).reshape(-1, len(COLUMNS))
     return {
         name: column.astype(np.int64) if name in WHOLE else column
         for name, column in zip(COLUMNS, values.T, strict=True)
@@ -320,8 +321,7 @@ def _numbers(row: list[str], where: str) -> list[float]:
 def scan_angles_deg(frame: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Optical scan angles (x, y) of unit vectors in a boresight's frame: (3, 3), (N, 3) to (N, 2) [deg]."""
     forward, sideways, upward = (directions @ frame.T).T
-    x = np.arctan2(sideways, np.hypot(forward, upward))
-    return np.degrees(np.stack([x, np.arctan2(upward, forward)], axis=1))
+    return np.degrees(np.stack([np.arctan2(sideways, np.hypot(forward, upward)), np.arctan2(upward, forward)], axis=1))
 
 
 def scan_directions(frame: np.ndarray, angles_deg: np.ndarray) -> np.ndarray:

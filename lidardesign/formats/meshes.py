@@ -87,44 +87,33 @@ def ply_file(comments: list[str], **elements: np.ndarray) -> bytes:
     """A PLY file of tables by the names of its elements, with comments."""
     header = ["ply", "format binary_little_endian 1.0", "comment lidardesign, metres, z up", *comments]
     for name, table in elements.items():
+        names = table.dtype.names or ()
         header.append(f"element {name} {len(table)}")
-        header += _properties(table.dtype)
+        if "vertex_indices" in names:
+            header.append("property list uchar int vertex_indices")
+        else:
+            header += [f"property {TYPES[table.dtype[name].str[1:]]} {name}" for name in names]
     return "\n".join([*header, "end_header", ""]).encode("ascii") + b"".join(
         table.tobytes() for table in elements.values()
     )
 
 
-def _properties(kinds: np.dtype) -> list[str]:
-    if "vertex_indices" in (kinds.names or ()):
-        return ["property list uchar int vertex_indices"]
-    return [f"property {TYPES[kinds[name].str[1:]]} {name}" for name in kinds.names or ()]
-
-
-def _points(places: np.ndarray, sensor: np.ndarray, kinds: list[tuple[str, str]]) -> np.ndarray:
-    """Table of points with the colours of their sensors, its other columns zero."""
-    table = np.zeros(len(places), dtype=kinds)
-    columns = (*places.T, *COLOURS[sensor % len(COLOURS)].T)
-    for (name, _), column in zip(PLACE + COLOUR, columns, strict=True):
-        table[name] = column
-    return table
+def _points(places: np.ndarray, sensor: np.ndarray) -> np.ndarray:
+    """Table of points with the colours of their sensors."""
+    return np.rec.fromarrays([*places.T, *COLOURS[sensor % len(COLOURS)].T], dtype=PLACE + COLOUR)
 
 
 def _ray_points(rays: Rays) -> np.ndarray:
-    table = _points(rays.origin_m, rays.sensor, PLACE + NORMAL + COLOUR + RAY)
-    columns = (*rays.direction.T, *rays.gate_m.T, rays.time_s, rays.sensor)
-    for (name, _), column in zip(NORMAL + RAY, columns, strict=True):
-        table[name] = column
-    return table
+    colour = COLOURS[rays.sensor % len(COLOURS)]
+    columns = [*rays.origin_m.T, *rays.direction.T, *colour.T, *rays.gate_m.T, rays.time_s, rays.sensor]
+    return np.rec.fromarrays(columns, dtype=PLACE + NORMAL + COLOUR + RAY)
 
 
 def _beams(rays: Rays, comments: list[str]) -> bytes:
     """PLY file with two points per ray, at the start and end of its gate, and the edge between them."""
     places = rays.origin_m[:, None] + rays.gate_m[:, :, None] * rays.direction[:, None]
-    edges = np.zeros(len(rays), dtype=EDGE)
-    edges["vertex1"], edges["vertex2"] = np.arange(2 * len(rays)).reshape(-1, 2).T
-    return ply_file(
-        comments, vertex=_points(places.reshape(-1, 3), np.repeat(rays.sensor, 2), PLACE + COLOUR), edge=edges
-    )
+    edges = np.rec.fromarrays(np.arange(2 * len(rays)).reshape(-1, 2).T, dtype=EDGE)
+    return ply_file(comments, vertex=_points(places.reshape(-1, 3), np.repeat(rays.sensor, 2)), edge=edges)
 
 
 def _frusta(sensors: list[tuple[int, Sensor]], comments: list[str]) -> bytes:
@@ -141,7 +130,7 @@ def _frusta(sensors: list[tuple[int, Sensor]], comments: list[str]) -> bytes:
     points, faces = [], []
     for number, (index, sensor) in enumerate(sensors):
         places = _frustum(sensor)
-        points.append(_points(places, np.full(len(places), index), PLACE + COLOUR))
+        points.append(_points(places, np.full(len(places), index)))
         faces.append(corners + number * len(places))
     table = np.zeros(len(faces) * len(corners), dtype=FACE)
     table["corners"], table["vertex_indices"] = 4, np.concatenate(faces)

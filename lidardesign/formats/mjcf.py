@@ -190,8 +190,9 @@ def read_mjcf(path: Path) -> Rig:
         azimuth, elevation = angles(np.array([ray.direction for ray in own]))
         gates = np.array([[ray.start_m or 0.0, ray.cutoff_m] for ray in own])
         name = _name(own, alone=sensors_of_body[own[0].body] == 1)
-        origin = np.array([ray.origin_m for ray in own])
-        sensors.append(RigSensor(name, origin, azimuth, elevation, gates, order=np.array(group)))
+        sensors.append(
+            RigSensor(name, np.array([ray.origin_m for ray in own]), azimuth, elevation, gates, order=np.array(group))
+        )
     return Rig("MuJoCo model", sensors, notes, "give the rangefinders a cutoff")
 
 
@@ -205,8 +206,11 @@ def _rays(stripped: ElementTree.Element, path: Path) -> list[_Ray]:
             data = mujoco.MjData(model)
             mujoco.mj_kinematics(model, data)
     except ValueError as error:
-        reason = " ".join(str(error).split()) or "no reason given"
-        raise DataError(f"MuJoCo cannot read it: {reason}", where=str(path), allowed=ALLOWED) from None
+        raise DataError(
+            f"MuJoCo cannot read it: {' '.join(str(error).split()) or 'no reason given'}",
+            where=str(path),
+            allowed=ALLOWED,
+        ) from None
     index = np.flatnonzero(model.sensor_type == int(mujoco.mjtSensor.mjSENS_RANGEFINDER))
     sites = model.sensor_objid[index]
     return [

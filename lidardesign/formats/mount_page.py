@@ -139,13 +139,15 @@ def write_mounts(design: DesignSpec, rays: Rays, path: Path, _: object = None) -
     links = [part for pose in poses for part in fixed_link(*pose, parent=parent)]
     robot = element("robot", {"name": identifier(design.name)}, [element("link", {"name": parent}), *links])
     commands = _transforms(mounted, parent)
-    files = {
-        "mounts.html": _page(design, mounted, commands).encode(),
-        "mounts.csv": csv_table([rows[0], *(row.values() for row in rows)]).encode(),
-        "mounts.urdf": document(robot),
-        "static_transforms.sh": "".join(f"{line} &\n" for line in commands).encode() + b"wait\n",
-    }
-    notes = write_folder(path, files)
+    notes = write_folder(
+        path,
+        {
+            "mounts.html": _page(design, mounted, commands).encode(),
+            "mounts.csv": csv_table([rows[0], *(row.values() for row in rows)]).encode(),
+            "mounts.urdf": document(robot),
+            "static_transforms.sh": "".join(f"{line} &\n" for line in commands).encode() + b"wait\n",
+        },
+    )
     regions = [one.sensor.region_m for one in mounted if one.sensor.region_m > 0]
     if regions:
         notes.append(f"rays of {len(regions)} sensors start anywhere in a region: the page gives its middle")
@@ -235,15 +237,16 @@ def _view(mounted: Sequence[MountedPart], title: str, across: int, up: int, dept
         forward, _, top = one.axes
         right, upwards = forward[[across, up]]
         share = math.hypot(right, upwards)
-        part = {
-            "name": one.name,
-            "is_head_on": share < HEAD_ON,
-            "is_away": sign * forward[depth] < 0,
-            "length": ARROW * share,
-            "turn_deg": math.degrees(math.atan2(-upwards, right)),
-            "top": UPRIGHT * top[[across, up]] * (1, -1),
-        }
-        parts.setdefault(tuple(place), []).append(part)
+        parts.setdefault(tuple(place), []).append(
+            {
+                "name": one.name,
+                "is_head_on": share < HEAD_ON,
+                "is_away": sign * forward[depth] < 0,
+                "length": ARROW * share,
+                "turn_deg": math.degrees(math.atan2(-upwards, right)),
+                "top": UPRIGHT * top[[across, up]] * (1, -1),
+            }
+        )
     return {
         "title": title,
         "across": "xyz"[across],

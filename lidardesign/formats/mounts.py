@@ -18,6 +18,7 @@ import numpy as np
 
 from lidardesign.errors import DataError
 from lidardesign.formats.names import distinct, identifier
+from lidardesign.formats.rig import members
 from lidardesign.numerics import COARSE_SLACK, SLACK
 from lidardesign.scenes.rays import DEFAULT_RATE_HZ, Rays
 from lidardesign.sensors.compare import angles_between
@@ -68,12 +69,10 @@ class Mount:
 def mounts(design: DesignSpec, rays: Rays) -> list[Mount]:
     """Mounts of the sensors of a design that fire rays, in their order."""
     names = distinct([identifier(sensor.name) for sensor in design.sensors], "_")
-    order = np.argsort(rays.sensor, kind="stable")
-    edges = np.searchsorted(rays.sensor[order], np.arange(len(design.sensors) + 1))
     return [
-        _mount(name, sensor, rays, order[edges[index] : edges[index + 1]])
-        for index, (name, sensor) in enumerate(zip(names, design.sensors, strict=True))
-        if edges[index] < edges[index + 1]
+        _mount(name, sensor, rays, own)
+        for name, sensor, own in zip(names, design.sensors, members(rays.sensor, len(names)), strict=True)
+        if len(own)
     ]
 
 
@@ -129,9 +128,9 @@ def origin_losses(mounted: Sequence[Mount]) -> list[str]:
     spread = [one for one in mounted if one.spread_m > SAME_M]
     if not spread:
         return []
-    rays, worst = sum(len(one.ray) for one in spread), max(one.spread_m for one in spread)
     return [
-        f"{rays} rays of {len(spread)} sensors start beside their sensor's middle: moved there, by up to {worst:.3g} m"
+        f"{sum(len(one.ray) for one in spread)} rays of {len(spread)} sensors start beside their sensor's middle: "
+        f"moved there, by up to {max(one.spread_m for one in spread):.3g} m"
     ]
 
 
@@ -140,10 +139,9 @@ def gate_losses(mounted: Sequence[Mount]) -> list[str]:
     wider = [one for one in mounted if one.gate_excess_m > SAME_M]
     if not wider:
         return []
-    worst = max(one.gate_excess_m for one in wider)
     return [
         f"the rays of {len(wider)} of {len(mounted)} sensors have gates of their own: the sensor's is the narrowest "
-        f"that holds them all, up to {worst:.3g} m wider"
+        f"that holds them all, up to {max(one.gate_excess_m for one in wider):.3g} m wider"
     ]
 
 
@@ -169,12 +167,19 @@ def places(mounted: Sequence[Mount], rays: Rays) -> list[Place]:
     found = []
     for mount in mounted:
         origins, first, place = np.unique(rays.origin_m[mount.ray], axis=0, return_index=True, return_inverse=True)
-        place = place.reshape(-1)
-        members = np.split(mount.ray[np.argsort(place, kind="stable")], np.cumsum(np.bincount(place))[:-1])
+        own = members(place.reshape(-1), len(origins))
         for number, here in enumerate(np.argsort(first)):
             name = mount.name if len(origins) == 1 else f"{mount.name}_place_{number}"
-            found.append(Place(name, mount, origins[here], members[here]))
+            found.append(Place(name, mount, origins[here], mount.ray[own[here]]))
     return found
+
+
+def near_losses(starts_m: np.ndarray, least_m: float, what: str, reason: str) -> list[str]:
+    """Note of the gates that start (N,) [m] before the least start of a format."""
+    near = np.count_nonzero(starts_m < least_m)
+    if not near:
+        return []
+    return [f"gates of {near} of {len(starts_m)} {what} start below {least_m:g} m: they start there, for {reason}"]
 
 
 def require_rays(design: DesignSpec, rays: Rays, what: str) -> None:
@@ -215,9 +220,10 @@ class EvenGrid:
 
     def directions(self) -> np.ndarray:
         """Unit vectors row by row upwards, each row by growing azimuth, shape (rows * columns, 3)."""
-        azimuth = np.linspace(*self.azimuth_rad, self.columns)
-        elevation = np.linspace(*self.elevation_rad, self.rows)
-        return direction(np.tile(azimuth, self.rows), np.repeat(elevation, self.columns))
+        return direction(
+            np.tile(np.linspace(*self.azimuth_rad, self.columns), self.rows),
+            np.repeat(np.linspace(*self.elevation_rad, self.rows), self.columns),
+        )
 
     def distance_rad(self, azimuth_rad: np.ndarray, elevation_rad: np.ndarray) -> np.ndarray:
         """Angle between rays and the grid rays of their cells, shape (N,) [rad]."""
@@ -233,11 +239,10 @@ def nearest_grid(azimuth_rad: np.ndarray, elevation_rad: np.ndarray) -> EvenGrid
     azimuth_rad = cut_behind(azimuth_rad)
     count = len(azimuth_rad)
     shapes = [(rows, max(round(count / rows), 1)) for rows in _row_counts(azimuth_rad, elevation_rad)]
-    most = max(count // MOST_CHANGED, 1)
     grids = [
         EvenGrid(columns, rows, _fitted(azimuth_rad, columns), _fitted(elevation_rad, rows))
         for rows, columns in shapes
-        if abs(rows * columns - count) <= most
+        if abs(rows * columns - count) <= max(count // MOST_CHANGED, 1)
     ]
 
     def misfit(grid: EvenGrid) -> float:

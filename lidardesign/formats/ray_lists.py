@@ -22,7 +22,7 @@ import numpy as np
 
 from lidardesign.errors import DataError
 from lidardesign.formats import ADAPTIVE, RAYS, Format
-from lidardesign.formats.rig import MOST_SENSORS, Rig, RigSensor, number_of
+from lidardesign.formats.rig import MOST_SENSORS, Rig, RigSensor, members, number_of
 from lidardesign.limits import MOST_RAYS
 from lidardesign.numerics import COARSE_SLACK, SLACK
 from lidardesign.run.arrays import NUMERIC_KINDS, csv_rows, csv_table, read_npz
@@ -120,11 +120,9 @@ def rig_of_columns(columns: RayColumns, kind: str) -> Rig:
     if np.abs(times - even).max() > EVEN_TIMES * max(even[-1] - even[0], np.abs(times).max()):
         notes.append(f"{TIME} is not kept: rays fire evenly over a frame, in the order of the file")
     gate = np.stack([start, end], axis=1)
-    order = np.argsort(columns.sensor, kind="stable")
-    rays_of = np.split(order, np.cumsum(np.bincount(columns.sensor, minlength=len(columns.names)))[:-1])
     sensors = [
         RigSensor(name, origin[rays], azimuth[rays], elevation[rays], gate[rays], order=rays)
-        for name, rays in zip(columns.names, rays_of, strict=True)
+        for name, rays in zip(columns.names, members(columns.sensor, len(columns.names)), strict=True)
     ]
     return Rig(kind, sensors, notes, f"add a column {END}")
 
@@ -186,8 +184,11 @@ def read_ray_csv(path: Path) -> Rig:
     indices = np.array([number_of(label) for label in labels], dtype=np.float64)
     is_number, is_index = np.isfinite(indices), (indices >= 0) & (indices < MOST_RAYS) & (indices % 1 == 0)
     for row in np.flatnonzero(is_number & ~is_index).tolist():
-        allowed = f"a whole number from 0 to {MOST_RAYS - 1}, or a name"
-        raise DataError(f"{SENSOR} is {labels[row][:LONGEST_CELL]!r}", where=locate(row, SENSOR), allowed=allowed)
+        raise DataError(
+            f"{SENSOR} is {labels[row][:LONGEST_CELL]!r}",
+            where=locate(row, SENSOR),
+            allowed=f"a whole number from 0 to {MOST_RAYS - 1}, or a name",
+        )
     if is_number.all():
         found, sensor = np.unique(indices, return_inverse=True)
         sensor_names = tuple(f"sensor_{int(index) + 1}" for index in found)
@@ -198,10 +199,10 @@ def read_ray_csv(path: Path) -> Rig:
     numbers = {}
     for name, column in cells.items():
         values = np.array([number_of(cell) for cell in column], dtype=np.float64)
-        if not np.isfinite(values).all():
-            row = int(np.argmin(np.isfinite(values)))
-            shown = repr(column[row][:LONGEST_CELL])
-            raise DataError(f"{name} is {shown}", where=locate(row, name), allowed="a finite number")
+        for row in np.flatnonzero(~np.isfinite(values)).tolist():
+            raise DataError(
+                f"{name} is {column[row][:LONGEST_CELL]!r}", where=locate(row, name), allowed="a finite number"
+            )
         numbers[name] = values
     return rig_of_columns(RayColumns(numbers, sensor.reshape(-1), sensor_names, locate), "rays CSV")
 
@@ -229,8 +230,7 @@ def read_ray_npz(path: Path) -> Rig:
         if values.dtype.kind not in "iuf":
             raise DataError(f"{name} is of type {values.dtype}", where=str(path), allowed="real numbers")
         numbers[name] = values.astype(np.float64)
-        if not np.isfinite(numbers[name]).all():
-            row = int(np.argmin(np.isfinite(numbers[name])))
+        for row in np.flatnonzero(~np.isfinite(numbers[name])).tolist():
             raise DataError(f"{name} is {numbers[name][row]}", where=locate(row, name), allowed="a finite number")
     indices = numbers.pop(SENSOR, np.zeros(shape))
     if (indices < 0).any() or (indices >= MOST_RAYS).any() or (indices % 1 != 0).any():
@@ -359,17 +359,22 @@ def read_sensor_csv(path: Path) -> DesignSpec:
     if abs(total - 1) > WEIGHT_SUM_TOLERANCE:
         notes.append(f"weights summed to {total:.6g} and were normalised")
         sensors = [replace(sensor, weight=sensor.weight / total) for sensor in sensors]
-    provenance = {"source": path.name, "format": "sensor CSV of the research code", "notes": notes}
-    return DesignSpec(name=path.stem, sensors=tuple(sensors), provenance=provenance)
+    return DesignSpec(
+        name=path.stem,
+        sensors=tuple(sensors),
+        provenance={"source": path.name, "format": "sensor CSV of the research code", "notes": notes},
+    )
 
 
 def _rows(path: Path) -> tuple[list[tuple[dict[str, float], str]], list[str]]:
     """Numbers by column name and the position of each row, with notes."""
     lines = csv_rows(path, RAY_TABLE)
     if not lines or len(lines) > MOST_SENSORS + 1:
-        found = f"has {len(lines)} rows" if lines else "is empty"
-        allowed = f"rows of {len(SENSOR_COLUMNS)} columns, at most {MOST_SENSORS}"
-        raise DataError(found, where=str(path), allowed=allowed)
+        raise DataError(
+            f"has {len(lines)} rows" if lines else "is empty",
+            where=str(path),
+            allowed=f"rows of {len(SENSOR_COLUMNS)} columns, at most {MOST_SENSORS}",
+        )
     first = [cell.strip() for cell in lines[0][1]]
     if any(number_of(cell) is not None for cell in first):
         names = SENSOR_COLUMNS if len(first) != len(SENSOR_COLUMNS) + 1 else (QUERY_COLUMN, *SENSOR_COLUMNS)
@@ -468,13 +473,11 @@ def write_sensor_csv(design: DesignSpec, rays: Rays, path: Path, _: object = Non
     ]
     z = interval_factor(DEFAULT_LEVEL)
     for sensor in design.sensors:
-        azimuth_sigma, elevation_sigma = (angle / (2 * z) for angle in sensor.field_of_view_rad)
-        if sensor.roll_rad != 0:
-            # the spreads along azimuth and elevation of a sensor that is rolled about its boresight
-            horizontal, vertical = azimuth_sigma, elevation_sigma
-            cosine, sine = math.cos(sensor.roll_rad), math.sin(sensor.roll_rad)
-            azimuth_sigma = math.hypot(cosine * horizontal, sine * vertical)
-            elevation_sigma = math.hypot(sine * horizontal, cosine * vertical)
+        horizontal, vertical = (angle / (2 * z) for angle in sensor.field_of_view_rad)
+        # the spreads along azimuth and elevation of a sensor that is rolled about its boresight
+        cosine, sine = math.cos(sensor.roll_rad), math.sin(sensor.roll_rad)
+        azimuth_sigma = math.hypot(cosine * horizontal, sine * vertical)
+        elevation_sigma = math.hypot(sine * horizontal, cosine * vertical)
         cosine = math.cos(sensor.elevation_rad)
         if azimuth_sigma >= cosine * FULL_TURN:
             # towards a pole the azimuth covers the whole turn; larger standard deviations make no difference
@@ -483,8 +486,7 @@ def write_sensor_csv(design: DesignSpec, rays: Rays, path: Path, _: object = Non
             azimuth_sigma = FULL_TURN
         else:
             azimuth_sigma /= cosine
-        covariance = np.zeros((3, 3)) if sensor.origin_covariance_m2 is None else sensor.origin_covariance_m2
-        upper, (start, end) = np.asarray(covariance)[np.triu_indices(3)], sensor.gate_m
+        upper, (start, end) = np.asarray(sensor.covariance_m2)[np.triu_indices(3)], sensor.gate_m
         row = [
             *sensor.origin_m, sensor.azimuth_rad, sensor.elevation_rad, (start + end) / 2, *upper,
             azimuth_sigma, elevation_sigma, (end - start) / (2 * z), sensor.weight,

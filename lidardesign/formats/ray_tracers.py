@@ -39,6 +39,7 @@ from lidardesign.formats.mounts import (
     fire_times_s,
     gate_losses,
     mounts,
+    near_losses,
     places,
     require_rays,
 )
@@ -100,19 +101,14 @@ def write_helios(design: DesignSpec, rays: Rays, path: Path, options: WriteOptio
     platforms = element("document")
     child(child(platforms, "platform", id="fixed", name="fixed", type="static"), "scannerMount", x=0, y=0, z=0)
     lost_m = RISE * PULSE_NS / NS_PER_S * SPEED_OF_LIGHT_M_S
-    near = np.count_nonzero(rays.gate_m[:, 0] < LEAST_START_M)
     notes = [
         *write_folder(path, {SCANNERS: document(scanners), PLATFORMS: document(platforms), **surveys}),
         f"the surveys name the scene {SCENE}: put yours beside them, and give the folder to helios as --assets",
         f"HELIOS++ drops returns up to {MM_PER_M * lost_m:.1f} mm behind a gate's start: the rise of a pulse of "
         f"{PULSE_NS} ns must begin inside",
         "all rays of a frame fire at once: their times within the frame are lost",
+        *near_losses(rays.gate_m[:, 0], LEAST_START_M, "rays", "HELIOS++ 2 sends no power through a gate from 0"),
     ]
-    if near:
-        notes.append(
-            f"gates of {near} of {len(rays)} rays start below {LEAST_START_M:g} m: they start there, for HELIOS++ 2 "
-            "sends no power through a gate from 0"
-        )
     if pulse_hz != options.rate_hz:
         notes.append(f"{options.rate_hz:g} frames per second became {pulse_hz}: HELIOS++ takes whole numbers only")
     return [*notes, *design_losses(design, mounted)]

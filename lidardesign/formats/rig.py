@@ -105,6 +105,11 @@ class Rig:
     end_hint: str = "give their ends in the file"
 
 
+def members(owners: np.ndarray, count: int) -> list[np.ndarray]:
+    """Indices of the entries (N,) of each of so many owners, in their order."""
+    return np.split(np.argsort(owners, kind="stable"), np.cumsum(np.bincount(owners, minlength=count))[:-1])
+
+
 def rig_design(rig: Rig, path: Path, reach_m: float | None) -> DesignSpec:
     """The design that fires exactly the rays of a rig.
 
@@ -158,8 +163,10 @@ def rig_design(rig: Rig, path: Path, reach_m: float | None) -> DesignSpec:
         for one, first, count in zip(gated, before, counts, strict=True)
     ]
     order = np.argsort(np.concatenate(places), kind="stable")
-    columns = ("origin_m", "azimuth_rad", "elevation_rad", "gate_m")
-    ordered = (np.concatenate([getattr(one, name) for one in gated])[order] for name in columns)
+    ordered = (
+        np.concatenate([getattr(one, name) for one in gated])[order]
+        for name in ("origin_m", "azimuth_rad", "elevation_rad", "gate_m")
+    )
     return DesignSpec(
         path.stem,
         tuple(sensor_of(one, name, total) for one, name in zip(gated, names, strict=True)),
@@ -181,8 +188,11 @@ def _check_numbers(one: RigSensor, path: Path) -> None:
     without_width = one.gate_m[:, 1] <= one.gate_m[:, 0]
     if without_width.any():
         start, end = one.gate_m[without_width][0]
-        found = f"a gate of {one.name!r} starts at {start:g} m and ends at {end:g} m"
-        raise DataError(found, where=str(path), allowed="an end beyond the start")
+        raise DataError(
+            f"a gate of {one.name!r} starts at {start:g} m and ends at {end:g} m",
+            where=str(path),
+            allowed="an end beyond the start",
+        )
 
 
 def number_of(text: str) -> float | None:
@@ -345,8 +355,10 @@ def rig_notes(rig: DesignSpec, constraints: Constraints, asked: Constraints) -> 
     sensors, own = len(rig.sensors), asked.as_document()
     has_rays = constraints.budget.rays is not None and asked.budget.rays is None
     rays = f", {constraints.budget.rays} rays" if has_rays else ""
-    counts = f"{sensors} sensor{'s' * (sensors > 1)}{rays}"
-    lines = [f"like {rig.name}: {counts}, at its places, fields of view and gates no wider"]
+    lines = [
+        f"like {rig.name}: {sensors} sensor{'s' * (sensors > 1)}{rays}, at its places, fields of view and gates "
+        "no wider"
+    ]
     single = sum(max(sensor.field_of_view_rad) <= math.radians(SMALLEST_FIELD_DEG) for sensor in rig.sensors)
     if single:
         lines.append(f"{single} of {sensors} sensors have no field of view: that of the fit is not bounded")

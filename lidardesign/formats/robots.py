@@ -107,10 +107,11 @@ def write_mjcf(design: DesignSpec, rays: Rays, path: Path, options: WriteOptions
         )
     if place.tag == "body":
         notes.append(f"rays ignore the geoms of {design.mount!r}, the body that carries the sensors")
-    when = f"at {options.rate_hz:g} Hz; in between they keep what they read" if options.rate_hz else "at every step"
     return [
         *notes,
-        f"rangefinders fire {when}",
+        f"rangefinders fire at {options.rate_hz:g} Hz; in between they keep what they read"
+        if options.rate_hz
+        else "rangefinders fire at every step",
         "a reading equal to the cutoff is a hit at or beyond the end of the gate; a negative one is no hit",
     ]
 
@@ -189,10 +190,17 @@ def _sites(places_m: np.ndarray, directions: np.ndarray, names: np.ndarray) -> l
 
 def _rangefinder(site: str, rays: Rays, ray: int, rate_hz: float) -> Element:
     start, end = rays.gate_m[ray]
-    user = numbers([start, end, rays.sensor[ray], rays.time_s[ray]])
     # a cutoff of 0 means none; without a number of samples MuJoCo ignores the interval
-    rate = {"nsample": "1", "interval": 1 / rate_hz} if rate_hz else {}
-    return element("rangefinder", {"name": site, "site": site, "cutoff": max(end, SLACK), "user": user, **rate})
+    return element(
+        "rangefinder",
+        {
+            "name": site,
+            "site": site,
+            "cutoff": max(end, SLACK),
+            "user": numbers([start, end, rays.sensor[ray], rays.time_s[ray]]),
+            **({"nsample": "1", "interval": 1 / rate_hz} if rate_hz else {}),
+        },
+    )
 
 
 LINK = "lidar"
@@ -286,8 +294,10 @@ def write_urdf(design: DesignSpec, rays: Rays, path: Path, options: WriteOptions
     design, rays, mounted = channel_mounts(design, rays)
     parts = [part for one in mounted for part in mounted_parts(one, options.rate_hz, parent=BASE)]
     write_atomic(path, document(element("robot", {"name": identifier(design.name)}, [*_base(), *parts])))
-    mass = f"{BASE} has a nominal mass of {BASE_MASS_KG:g} kg, without which Gazebo would leave out the sensors"
-    return [*urdf_losses(design, mounted, rays), mass]
+    return [
+        *urdf_losses(design, mounted, rays),
+        f"{BASE} has a nominal mass of {BASE_MASS_KG:g} kg, without which Gazebo would leave out the sensors",
+    ]
 
 
 URDF = Format(
@@ -353,14 +363,17 @@ def write_xacro(design: DesignSpec, rays: Rays, path: Path, options: WriteOption
     """Write the macro, atomically; returns its usage and notes of what the format cannot hold."""
     design, rays, mounted = channel_mounts(design, rays)
     name = identifier(design.name)
-    placed = {"parent": "${parent}", "prefix": "${prefix}"}
-    parts = [part for one in mounted for part in mounted_parts(one, options.rate_hz, **placed)]
+    parts = [
+        part for one in mounted for part in mounted_parts(one, options.rate_hz, parent="${parent}", prefix="${prefix}")
+    ]
     macro = element(MACRO, {"name": name, "params": "parent prefix:=''"}, parts)
     write_atomic(
         path, document(element("robot", {"xmlns:xacro": "http://www.ros.org/wiki/xacro", "name": name}, [macro]))
     )
-    usage = f'include it and call <xacro:{name} parent="base_link"/>: poses are relative to the parent'
-    return [usage, *urdf_losses(design, mounted, rays)]
+    return [
+        f'include it and call <xacro:{name} parent="base_link"/>: poses are relative to the parent',
+        *urdf_losses(design, mounted, rays),
+    ]
 
 
 XACRO = Format(

@@ -185,9 +185,8 @@ def read_sdf(path: Path) -> Rig:
     version = [int(part) for part in root.get("version", "").split(".") if part.isdecimal()]
     if version and version < [1, 7]:
         # poses of these versions are relative to `frame`, renamed `relative_to` since
-        for pose in root.iter("pose"):
-            if "frame" in pose.attrib:
-                pose.attrib.setdefault("relative_to", pose.attrib["frame"])
+        for pose in root.iterfind(".//pose[@frame]"):
+            pose.attrib.setdefault("relative_to", pose.attrib["frame"])
     notes: dict[str, None] = {}
     sensors: list[RigSensor] = []
     longer: list[str] = []

@@ -49,6 +49,7 @@ from lidardesign.formats.mounts import (
     grid_of,
     grid_sensor_losses,
     mounts,
+    near_losses,
     origin_losses,
     places,
     require_rays,
@@ -111,29 +112,30 @@ def _blueprint(mount: Mount, rate_hz: float) -> dict[str, Any]:
     step_rad = (grid.azimuth_rad[1] - grid.azimuth_rad[0]) / max(grid.columns - 1, 1)
     turn_hz, field_deg = _sweep(max(math.degrees(step_rad) * grid.columns, NARROWEST_DEG), rate_hz)
     low_deg, high_deg = (math.degrees(value) for value in grid.elevation_rad)
-    attributes = {
-        "channels": str(grid.rows),
-        "range": repr(mount.gate_m[1]),
-        "points_per_second": str(round(len(grid) * rate_hz)),
-        "rotation_frequency": repr(turn_hz),
-        "upper_fov": repr(high_deg),
-        "lower_fov": repr(low_deg),
-        "horizontal_fov": repr(field_deg),
-        # a design has no noise: every hit is reported, at its exact range
-        "dropoff_general_rate": "0.0",
-        "dropoff_zero_intensity": "0.0",
-        "noise_stddev": "0.0",
-        # at every frame: an interval of the same length leaves frames out by its rounding
-        "sensor_tick": "0.0",
-        "role_name": mount.name,
-    }
-    location = dict(zip("xyz", (MIRROR @ mount.origin_m).tolist(), strict=True))
     return {
         "id": mount.name,
         "name": mount.sensor.name,
         "type": "sensor.lidar.ray_cast",
-        "attributes": attributes,
-        "transform": {"location": location, "rotation": _rotation(mount, grid, field_deg)},
+        "attributes": {
+            "channels": str(grid.rows),
+            "range": repr(mount.gate_m[1]),
+            "points_per_second": str(round(len(grid) * rate_hz)),
+            "rotation_frequency": repr(turn_hz),
+            "upper_fov": repr(high_deg),
+            "lower_fov": repr(low_deg),
+            "horizontal_fov": repr(field_deg),
+            # a design has no noise: every hit is reported, at its exact range
+            "dropoff_general_rate": "0.0",
+            "dropoff_zero_intensity": "0.0",
+            "noise_stddev": "0.0",
+            # at every frame: an interval of the same length leaves frames out by its rounding
+            "sensor_tick": "0.0",
+            "role_name": mount.name,
+        },
+        "transform": {
+            "location": _vector(MIRROR @ mount.origin_m),
+            "rotation": _rotation(mount, grid, field_deg),
+        },
     }
 
 
@@ -181,10 +183,9 @@ def write_osi(design: DesignSpec, rays: Rays, path: Path, options: WriteOptions)
     # the next frame
     times_us = np.rint(fire_times_s(rays, options.rate_hz) * MICROSECONDS_PER_S)
     times_us = np.minimum(times_us, math.ceil(MICROSECONDS_PER_S / options.rate_hz) - 1)
-    cycle_ns = round(NANOSECONDS_PER_S / options.rate_hz)
     mounted = mounts(design, rays)
     found = places(mounted, rays)
-    seconds, nanoseconds = divmod(cycle_ns, NANOSECONDS_PER_S)
+    seconds, nanoseconds = divmod(round(NANOSECONDS_PER_S / options.rate_hz), NANOSECONDS_PER_S)
     whole = {
         "range": float(rays.gate_m[:, 1].max()),
         # 64-bit integers are text in protobuf's JSON
@@ -296,14 +297,13 @@ def write_isaac_usd(design: DesignSpec, rays: Rays, path: Path, options: WriteOp
     notes = [*design_losses(design, mounted), *origin_losses(mounted)]
     if whole_hz != options.rate_hz:
         notes.append(f"frame rates there are whole numbers: {options.rate_hz:g} Hz is {whole_hz} Hz")
-    near = sum(one.gate_m[0] < LEAST_START_M for one in mounted)
-    if near:
-        notes.append(
-            f"gates of {near} of {len(mounted)} sensors start below {LEAST_START_M:g} m: they start there, for Isaac's "
-            "near ranges are above 0"
-        )
-    notes.append("angles and lengths are kept in single precision, firing times in whole nanoseconds")
-    return [*notes, *renamed_note([one.sensor.name for one in mounted], [one.name for one in mounted])]
+    starts_m = np.array([one.gate_m[0] for one in mounted])
+    return [
+        *notes,
+        *near_losses(starts_m, LEAST_START_M, "sensors", "Isaac's near ranges are above 0"),
+        "angles and lengths are kept in single precision, firing times in whole nanoseconds",
+        *renamed_note([one.sensor.name for one in mounted], [one.name for one in mounted]),
+    ]
 
 
 ISAAC_USD = Format(

@@ -63,8 +63,7 @@ class SceneCaster:
 
     def trace(self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> Hits:
         """First hits of finite float64 rays of unit length, cast once; hits at or beyond limits (N,) [m] are misses."""
-        (hits,) = _traced([self], origins, directions, limit_m, None)
-        return hits
+        return _traced([self], origins, directions, limit_m, None)[0]
 
     def crossings(
         self, origins: np.ndarray, directions: np.ndarray, start_m: np.ndarray, limit_m: np.ndarray
@@ -158,11 +157,12 @@ def trace_each(
     """
     resting = [None if caster.primitives or caster.moving else caster.at_rest for caster in casters]
     if any(meshes is None for meshes in resting):
-        parts = [
-            caster.trace(origins[begin:end], directions[begin:end], limit_m[begin:end])
-            for caster, begin, end in zip(casters, starts[:-1], starts[1:], strict=True)
-        ]
-        return Hits.joined(parts)
+        return Hits.joined(
+            [
+                caster.trace(origins[begin:end], directions[begin:end], limit_m[begin:end])
+                for caster, begin, end in zip(casters, starts[:-1], starts[1:], strict=True)
+            ]
+        )
     # for meshes at rest everything except Embree's calls is done for all rays together
     counts = np.diff(starts)
     local = origins - np.repeat([meshes.triangles.centre_m for meshes in resting], counts, axis=0)

@@ -101,8 +101,7 @@ def _sides(count: int, first: np.ndarray, second: np.ndarray, agree: np.ndarray)
     graph = coo_array((np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(2 * count, 2 * count))
     sheet = connected_components(graph, directed=False)[1]
     part = np.minimum(sheet[:count], sheet[count:])
-    one_sided = sheet[:count] == sheet[count:]
-    return part, (sheet[:count] != part) & ~one_sided
+    return part, (sheet[:count] != part) & (sheet[:count] != sheet[count:])
 
 
 COLOURS = "colours"
@@ -354,8 +353,13 @@ def _oriented(
         return faces, sign
     if not found:
         return faces, "solid"
-    closed = f"closed mesh with {found}: it has no outside: unsigned distances"
-    notes.append(BackgroundNote(f"open mesh ({found}): unsigned distances, no inside" if open_edges else closed))
+    notes.append(
+        BackgroundNote(
+            f"open mesh ({found}): unsigned distances, no inside"
+            if open_edges
+            else f"closed mesh with {found}: it has no outside: unsigned distances"
+        )
+    )
     return faces, "unsigned"
 
 
@@ -417,8 +421,9 @@ def _parts(path: Path, data: bytes) -> Iterator[tuple[trimesh.Trimesh, np.ndarra
     else:
         check_gltf(data, str(path))
         options = {"skip_materials": True}
-    resolver = _SameFolder(path)
-    scene = trimesh.load_scene(io.BytesIO(data), file_type=suffix[1:], resolver=resolver, process=False, **options)
+    scene = trimesh.load_scene(
+        io.BytesIO(data), file_type=suffix[1:], resolver=_SameFolder(path), process=False, **options
+    )
     points = [part.vertices for part in scene.geometry.values() if not isinstance(part, trimesh.Trimesh)]
     if len(points) == len(scene.geometry):  # refused as a point cloud
         yield trimesh.Trimesh(np.concatenate([np.zeros((0, 3)), *points]), process=False), np.eye(4)

@@ -46,8 +46,9 @@ def _rows(data: bytes, where: str, joining: bytes | None = None) -> Iterator[tup
     for line, text in enumerate(lines, 1):
         begun, before = begun or line, before + text.rstrip()
         if len(before) > LONGEST_LINE:
-            found = f"has a line of {len(before)} characters"
-            raise DataError(found, where=f"{where}:{begun}", allowed=f"{LONGEST_LINE}")
+            raise DataError(
+                f"has a line of {len(before)} characters", where=f"{where}:{begun}", allowed=f"{LONGEST_LINE}"
+            )
         if joining and before.endswith(joining) and line < len(lines):
             before = before.removesuffix(joining) + b" "
             continue
@@ -60,8 +61,7 @@ def _rows(data: bytes, where: str, joining: bytes | None = None) -> Iterator[tup
 def _point(words: list[bytes], where: str, line: int, most: float = math.inf) -> list[float]:
     """Finite numbers of a vertex in a line: three, or up to `most`."""
     if not 3 <= len(words) <= most:
-        allowed = "3 or more" if most > 3 else "3"
-        raise DataError(f"has {len(words)} values", where=f"{where}:{line}", allowed=allowed)
+        raise DataError(f"has {len(words)} values", where=f"{where}:{line}", allowed="3 or more" if most > 3 else "3")
     try:
         values = [float(word) for word in words]
     except ValueError:
@@ -120,15 +120,21 @@ def read_obj(data: bytes, where: str) -> Triangles:
 def _named_vertex(corner: bytes, totals: dict[bytes, int], before: dict[bytes, int], place: str) -> int:
     """Index of the vertex of a face's corner, from 0, with all of its indices checked."""
     if not OBJ_CORNER.fullmatch(corner):
-        shown, allowed = corner[:40].decode(errors="replace"), "whole numbers, as 1, 1/2, 1//3 or 1/2/3"
-        raise DataError(f"a corner of the face is {shown!r}", where=place, allowed=allowed)
+        raise DataError(
+            f"a corner of the face is {corner[:40].decode(errors='replace')!r}",
+            where=place,
+            allowed="whole numbers, as 1, 1/2, 1//3 or 1/2/3",
+        )
     indices = []
     for word, number in zip(OBJ_LISTS, corner.split(b"/"), strict=False):
         named = int(number or 1)
         index = named - 1 if named > 0 else before[word] + named if named else -1
         if number and not 0 <= index < totals[word]:
-            allowed = f"1 to {totals[word]}, or as far back from here as there are some before it"
-            raise DataError(f"a face names {OBJ_LISTS[word]} {named}", where=place, allowed=allowed)
+            raise DataError(
+                f"a face names {OBJ_LISTS[word]} {named}",
+                where=place,
+                allowed=f"1 to {totals[word]}, or as far back from here as there are some before it",
+            )
         indices.append(index)
     return indices[0]
 
@@ -225,8 +231,12 @@ def check_ply(data: bytes, where: str) -> None:
     if not data.startswith(b"ply") or not found:
         raise DataError("has no header from `ply` to `end_header`", where=where, hint=AGAIN_HINT)
     if len(header) > LONGEST_HEADER or (body.count(b"\n") > MOST_ROWS and b"ascii" in header):
-        allowed = f"{LONGEST_HEADER} characters of header, and {MOST_ROWS} lines of text"
-        raise DataError("has too long a header or too many lines", where=where, allowed=allowed, hint=BINARY_HINT)
+        raise DataError(
+            "has too long a header or too many lines",
+            where=where,
+            allowed=f"{LONGEST_HEADER} characters of header, and {MOST_ROWS} lines of text",
+            hint=BINARY_HINT,
+        )
     is_text, name, least, total = b"ascii" in header.partition(b"element")[0], "", 0, 0
     for line, words in enumerate((text.split() for text in header.decode(errors="replace").splitlines()), 1):
         if words[:1] == ["element"]:
@@ -234,8 +244,12 @@ def check_ply(data: bytes, where: str) -> None:
                 raise DataError("is not a count of elements", where=f"{where}:{line}", allowed="element NAME COUNT")
             name, count = words[1], int(words[2])
             if name == "tristrips" and count:
-                found, hint = "has triangle strips", "open it in MeshLab, which reads them, and export it as PLY"
-                raise DataError(found, where=f"{where}:{line}", allowed="an element `face`", hint=hint)
+                raise DataError(
+                    "has triangle strips",
+                    where=f"{where}:{line}",
+                    allowed="an element `face`",
+                    hint="open it in MeshLab, which reads them, and export it as PLY",
+                )
             total += count
         elif words[:1] == ["property"] and name:
             least += count * (PLY_BYTES.get(words[-2], 4) if words[1] != "list" else 1)
@@ -303,13 +317,19 @@ def _check_references(item: Any, count: int, place: str, where: str) -> None:
         if isinstance(index, dict):  # an object that is called so, with keys of its own
             return
         if type(index) is not int or not 0 <= index < count:
-            allowed = f"0 to {count - 1}" if count else "nothing: there is no such list"
-            raise DataError(f"{place} names {str(index)[:40]}", where=where, allowed=allowed)
+            raise DataError(
+                f"{place} names {str(index)[:40]}",
+                where=where,
+                allowed=f"0 to {count - 1}" if count else "nothing: there is no such list",
+            )
 
 
 def _check_accessors(document: dict[str, Any], where: str) -> None:
-    views = document.get("bufferViews") or ()
-    copied = sum(view["byteLength"] for view in views if isinstance(view, dict) and "byteLength" in view)
+    copied = sum(
+        view["byteLength"]
+        for view in document.get("bufferViews") or ()
+        if isinstance(view, dict) and "byteLength" in view
+    )
     for number, accessor in enumerate(document.get("accessors") or ()):
         place = f"accessors[{number}]"
         if not isinstance(accessor, dict) or accessor.get("type") not in COMPONENTS or "count" not in accessor:

@@ -191,8 +191,10 @@ def _compiled(spec: mujoco.MjSpec, path: Path) -> tuple[mujoco.MjModel, list[str
         spec.compiler.boundmass = spec.compiler.boundinertia = LEAST_MASS_KG
         spec.compiler.balanceinertia = True
         reason = " ".join(str(error).split())
-        changed = f"meshes weigh as shells and bodies {LEAST_MASS_KG:g} kg or more, which no ray meets"
-        return spec.compile(), [f"{path.name}: MuJoCo refuses its masses ({reason}): {changed}"]
+        return spec.compile(), [
+            f"{path.name}: MuJoCo refuses its masses ({reason}): meshes weigh as shells and bodies {LEAST_MASS_KG:g} "
+            "kg or more, which no ray meets"
+        ]
 
 
 def _conversion(folder: str, pattern: str) -> str:
@@ -217,8 +219,11 @@ def _check_places(model: mujoco.MjModel, path: Path) -> None:
         if wrong.any():
             number = int(np.argmax(wrong))
             called = (model.joint if kind == "jnt" else getattr(model, kind))(number).name
-            found = f"{name} of {called or f'{kind} {number}'!r} is {' '.join(map(str, rows[number].tolist()))}"
-            raise DataError(found, where=str(path), allowed=f"numbers up to {most:g}")
+            raise DataError(
+                f"{name} of {called or f'{kind} {number}'!r} is {' '.join(map(str, rows[number].tolist()))}",
+                where=str(path),
+                allowed=f"numbers up to {most:g}",
+            )
     places = int((model.hfield_nrow * model.hfield_ncol).sum())
     if places > MOST_PLACES:
         raise DataError(f"has {places} places of height fields", where=str(path), allowed=f"at most {MOST_PLACES}")
@@ -284,8 +289,7 @@ def visible_geoms(
         name = model.body(body).name or f"body {body}"
         geoms = chosen[model.geom_bodyid[chosen] == body].tolist()
         nameless = [geom for geom in geoms if _is_mesh(model, geom) and not model.geom(geom).name]
-        parts = [(geom, [geom]) for geom in geoms if geom not in nameless[1:]]
-        parts = [(geom, nameless if geom in nameless else own) for geom, own in parts]
+        parts = [(geom, nameless if geom in nameless else [geom]) for geom in geoms if geom not in nameless[1:]]
         for number, (geom, own) in enumerate(parts, 1):
             label = model.geom(geom).name
             full = name if len(parts) == 1 else f"{name} {label or number}"
@@ -398,8 +402,8 @@ def _height_field(model: mujoco.MjModel, name: str, number: int) -> Mesh:
     rim = np.concatenate([index[0, :-1], index[:-1, -1], index[-1, :0:-1], index[:0:-1, 0]])
     foot, middle = np.arange(len(rim)) + rows * columns, np.full(len(rim), rows * columns + len(rim))
     after, after_foot = np.roll(rim, -1), np.roll(foot, -1)
-    for corners in ((foot, after_foot, after), (foot, after, rim), (after_foot, foot, middle)):
-        faces.append(np.stack(corners, axis=1))
+    sides = ((foot, after_foot, after), (foot, after, rim), (after_foot, foot, middle))
+    faces += [np.stack(corners, axis=1) for corners in sides]
     feet = np.concatenate([top[rim, :2], [[0.0, 0.0]]])
     vertices = np.concatenate([top, np.column_stack([feet, np.full(len(feet), -base_m)])])
     return check_mesh(vertices, np.concatenate(faces), where=name)
@@ -573,5 +577,7 @@ def _unread_notes(root: ElementTree.Element, path: Path) -> list[str]:
     what, hint = f"MuJoCo reads no {files[0].suffix}", _conversion(os.path.commonpath(folders), f"*{files[0].suffix}")
     if not any(tags & SHAPES for tags in links.values()):
         raise DataError(f"{what}, and no other shape is left", where=str(path), hint=hint)
-    instead = f"rays meet other shapes of links, as those for collisions; links without any: {bare or 'none'}"
-    return [f"{path.name}: {what}, so {instead}; to read them: {hint}"]
+    return [
+        f"{path.name}: {what}, so rays meet other shapes of links, as those for collisions; links without any: "
+        f"{bare or 'none'}; to read them: {hint}"
+    ]

@@ -128,8 +128,14 @@ class Rays(FlatLists):
     ) -> Rays:
         """Rays from angles (N,), which are kept to the last digit, fired evenly over a frame at the default rate."""
         looking = direction(azimuth_rad, elevation_rad)
-        times = fire_times(len(looking), DEFAULT_RATE_HZ)
-        return cls(origin_m, looking, gate_m, sensor, times, np.stack([azimuth_rad, elevation_rad], axis=1))
+        return cls(
+            origin_m,
+            looking,
+            gate_m,
+            sensor,
+            fire_times(len(looking), DEFAULT_RATE_HZ),
+            np.stack([azimuth_rad, elevation_rad], axis=1),
+        )
 
     @classmethod
     def joined(cls, parts: Sequence[Rays]) -> Rays:

@@ -122,8 +122,11 @@ def check_triangles(vertices: np.ndarray, faces: np.ndarray, where: str = "mesh"
         DataError: What is wrong, and how many.
     """
     if vertices.size and not faces.size:
-        found = f"has {len(vertices)} points and no faces: it is a point cloud or lines, not a mesh"
-        raise DataError(found, where=where, hint=CLOUD_HINT)
+        raise DataError(
+            f"has {len(vertices)} points and no faces: it is a point cloud or lines, not a mesh",
+            where=where,
+            hint=CLOUD_HINT,
+        )
     if not vertices.size:
         raise DataError("has no faces (an empty or unreadable mesh)", where=where, hint="open it in a mesh viewer")
     if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
@@ -424,8 +427,9 @@ class Scene:
             raise DataError(f"scene {self.name!r}: bodies have different numbers of frames {sorted(counts)}")
         for name, kind in (("medium", Medium), ("ambient", Ambient), ("receiver", Receiver)):
             if not isinstance(getattr(self, name), kind | None):
-                found = repr(getattr(self, name))
-                raise DataError(f"scene {self.name!r}: {name} is {found}", allowed=f"{kind.__name__}(...) or None")
+                raise DataError(
+                    f"scene {self.name!r}: {name} is {getattr(self, name)!r}", allowed=f"{kind.__name__}(...) or None"
+                )
         if not isinstance(self.group, str | None):
             raise DataError(f"scene {self.name!r}: group is {self.group!r}", allowed="text or None")
         if not (math.isfinite(self.frame_rate_hz) and self.frame_rate_hz > 0):

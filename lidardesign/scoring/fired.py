@@ -90,8 +90,11 @@ def assign_devices(positions: Positions, devices: Devices) -> Positions:
     """Rays of one sensor as rays of devices; those that have sensors keep them."""
     if devices == ONE_DEVICE or any(rays.sensor.any() for rays in positions):
         return positions
-    light = [None if devices.light is None else np.full(len(rays), devices.light) for rays in positions]
     return tuple(
-        replace(rays, sensor=np.arange(len(rays)) % devices.number, light=own)
-        for rays, own in zip(positions, light, strict=True)
+        replace(
+            rays,
+            sensor=np.arange(len(rays)) % devices.number,
+            light=None if devices.light is None else np.full(len(rays), devices.light),
+        )
+        for rays in positions
     )

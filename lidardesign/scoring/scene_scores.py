@@ -83,8 +83,7 @@ def score_lists(
                 repeats=[number for positions in group for number in _repeats(positions)],
             )
         )
-        rays = sum(_count(positions) for positions in group)
-        per_ray = (time.perf_counter() - started) / max(rays, 1)
+        per_ray = (time.perf_counter() - started) / max(sum(map(_count, group)), 1)
         for positions in group:
             returns = returns_of(positions, scene, [next(found) for _ in positions])
             started = time.perf_counter()
@@ -376,18 +375,16 @@ def prepare_for(
     seed: int,
     planner: Planner | None,
 ) -> Any:
-    """What a task prepares for one set of rays, with the plan of each scene; the rest as of `Preparation`."""
+    """What a task prepares for one set of rays, as another process gets it: scores by workers are the same.
+
+    Arguments are the plan of each scene, and the rest as of `Preparation`.
+    """
     returns = []
     for number, (scene, plan) in enumerate(zip(scenes, plans, strict=True)):
         # names of scenes may repeat, also those of held-out ones, and noise follows them
         noise = int(random_generator(seed, PREPARE, number).integers(2**63))
         physics = planner.physics(plan, noise) if planner and plan else None
         returns.append(returns_in_scene(scene, positions, build_casters(scene), physics))
-    return _checked_preparation(task, scenes, returns, seed)
-
-
-def _checked_preparation(task: Task, scenes: Sequence[Scene], returns: Sequence[Sequence[Returns]], seed: int) -> Any:
-    """What a task prepares from returns, as another process gets it: scores by workers are the same."""
     where = f"task {task.name}"
     with called_on(task, "prepare", where, scenes):
         made = task.prepare(scenes, returns, seed)
@@ -466,8 +463,9 @@ class TrainingScorer:
         physics = self._physics(number, planned or lists, casters)
         plan = self.plans.get(0) if self._plans_once else None
         prepared = None if self._preparation is None else self._preparation.of(lists, plan)
-        found = score_lists(self.task, self.metric, scene, lists, casters, physics, prepared)
-        return [score.value for score, _ in found]
+        return [
+            score.value for score, _ in score_lists(self.task, self.metric, scene, lists, casters, physics, prepared)
+        ]
 
     def _physics(self, number: int, lists: Sequence[Positions], casters: Sequence[SceneCaster]) -> Physics | None:
         """The effects that a scene calls for, which sets of rays say where they are the first."""
@@ -478,7 +476,9 @@ class TrainingScorer:
             plan = self.planner.plan(self._drawn[number], [rays for one in lists for rays in one], casters)
             if self._plans_once:
                 # the bound is kept
-                kept = (replace(one, on=one.on and one.name != "multipath") for one in plan.decisions)
-                plan = replace(plan, decisions=tuple(kept))
+                plan = replace(
+                    plan,
+                    decisions=tuple(replace(one, on=one.on and one.name != "multipath") for one in plan.decisions),
+                )
             self.plans[planned] = plan
         return self.planner.physics(self.plans[planned], self.seed)

@@ -18,7 +18,7 @@ from lidardesign.errors import ConfigError
 from lidardesign.parts.catalogue import parts_of
 from lidardesign.parts.part import Part
 from lidardesign.scenes.rays import Rays
-from lidardesign.scenes.scene import Ambient, Body, Box, Scene
+from lidardesign.scenes.scene import Ambient, Body, Box, Scene, rigid
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.detector.physics import Detector, Physics, bin_width_m, metres
@@ -85,9 +85,11 @@ class Claim:
             pulses_per_frame=photons.pulses_per_frame * (1.0 if detector.is_flood else scale),
         )
         bench = replace(detector, photons=photons, emitters="shared", bins=None)
-        pose = np.eye(4)
-        pose[0, 3] = 1.5 * self.range_m
-        plate = Body(Box((self.range_m / 2, self.far_m, self.far_m)), poses=pose, reflectance=self.reflectance)
+        plate = Body(
+            Box((self.range_m / 2, self.far_m, self.far_m)),
+            poses=rigid(translation_m=(1.5 * self.range_m, 0.0, 0.0)),
+            reflectance=self.reflectance,
+        )
         scene = Scene((plate,), ambient=Ambient(self.klux * LUX_PER_KLUX) if self.klux else None)
         behind_m = BEHIND_SIGMAS * metres(detector.timing_sigma_s) + bin_width_m(detector)
         looking, none = np.tile([1.0, 0.0, 0.0], (count, 1)), np.zeros(count)
@@ -153,9 +155,11 @@ def light_notes(design: DesignSpec, detector: Detector) -> list[str]:
         return []
     known = [name for name, part in kinds.items() if part_light(part, detector, part.rays) is not None]
     unknown = [name for name in kinds if name not in known]
-    lines = [f"light as data sheets imply: {', '.join(known)}"] * bool(known)
-    own = f"no stated range sets the light of {', '.join(unknown)}: that of {detector.name} is used"
-    return [*lines, *[own] * bool(unknown)]
+    lines = {
+        f"light as data sheets imply: {', '.join(known)}": known,
+        f"no stated range sets the light of {', '.join(unknown)}: that of {detector.name} is used": unknown,
+    }
+    return [line for line, names in lines.items() if names]
 
 
 @dataclass(frozen=True)
@@ -197,10 +201,10 @@ def _reckoned_m(part: Part) -> float | None:
     light = part_light(part, detector, part.rays)
     if light is None:
         return None
-    sunny = replace(claim, klux=FULL_SUN_KLUX)
 
     def reaches(range_m: float) -> bool:
-        return replace(sunny, range_m=range_m).detected(detector, part.rays, light) >= claim.share
+        sunny = replace(claim, klux=FULL_SUN_KLUX, range_m=range_m)
+        return sunny.detected(detector, part.rays, light) >= claim.share
 
     found = _edge(reaches, max(claim.near_m, NEAREST_SHARE * claim.range_m), claim.range_m)
     return found if reaches(found) else None
@@ -210,8 +214,9 @@ def reaches_of(design: DesignSpec) -> list[Reach]:
     """How far each sensor of a design of parts reaches; empty where none is a part."""
     kinds = {part.name: part for part in parts_of(design) if part is not None}
     reach = {name: reach_of(part) for name, part in kinds.items()}
-    any_part = any(sensor.part for sensor in design.sensors)
-    return [reach.get(sensor.part or "", Reach()) for sensor in design.sensors] if any_part else []
+    if not any(sensor.part for sensor in design.sensors):
+        return []
+    return [reach.get(sensor.part or "", Reach()) for sensor in design.sensors]
 
 
 def reach_notes(design: DesignSpec) -> list[str]:

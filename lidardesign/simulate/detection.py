@@ -95,9 +95,17 @@ def _from_photons(scene: Scene, frame: int, light: ArrivingLight, physics: Physi
     counts = count_photons(scene, frame, light, physics)
     sigma_m = metres(detector.timing_sigma_s)
     half = int(FWHM_PER_SIGMA * sigma_m / (2 * bins.width_m))
-    known = _known_level(light, physics)
-    matched = detector.estimator == "matched"
-    judged = (counts, bins.offset, bins.end_shares, bins.width_m, sigma_m, half, known, detector.false_alarm, matched)
+    judged = (
+        counts,
+        bins.offset,
+        bins.end_shares,
+        bins.width_m,
+        sigma_m,
+        half,
+        _known_level(light, physics),
+        detector.false_alarm,
+        detector.estimator == "matched",
+    )
     if detector.correction == "coates" and detector.photons.dead_s > 0:
         # it judges in the same way, and finds nothing to correct, where it is never blind
         dead_s = detector.photons.dead_s if "pile_up" in physics.effects else 0.0
@@ -146,8 +154,9 @@ def _strongest(
     total = np.bincount(ray, weights=weight, minlength=len(path_m))
     path_m += moved / np.where(total > 0, total, 1.0)
     if "jitter" in physics.effects:
-        key = physics.stream("jitter", scene, frame)
-        path_m = add_timing_errors(path_m, np.arange(count), np.zeros(count, int), detector, key)
+        path_m = add_timing_errors(
+            path_m, np.arange(count), np.zeros(count, int), detector, physics.stream("jitter", scene, frame)
+        )
         path_m = np.clip(path_m, windows_m[:, 0], np.nextafter(windows_m[:, 1], windows_m[:, 0]))
     if "quantisation" in physics.effects:
         path_m = round_to_bins(path_m, windows_m, detector)
@@ -242,8 +251,8 @@ def count_photons(scene: Scene, frame: int, light: ArrivingLight, physics: Physi
         total = light.pulses * light.per_metre * np.diff(light.bins.windows_m, axis=1)[:, 0]
         _add_even(counts, light, light.bins.windows_m, total[:, None], physics.stream("ambient", scene, frame))
     if light.haze is not None:
-        key = physics.stream("atmosphere", scene, frame)
-        _add_even(counts, light, light.edges_m, light.pulses[:, None] * light.haze, key)
+        haze = light.pulses[:, None] * light.haze
+        _add_even(counts, light, light.edges_m, haze, physics.stream("atmosphere", scene, frame))
     if "pile_up" in physics.effects:
         key = physics.stream("pile_up", scene, frame)
         counts = survive_dead_time(counts, light.bins, physics.detector.photons, light.pulses, key, light.first_ray)
@@ -291,8 +300,9 @@ def _add_one_by_one(
         stray = normal_quantiles(rest)
     path_m = light.path_m[echo] + metres(detector.pulse_sigma_s) * stray
     if "jitter" in effects:
-        jitter = physics.stream("jitter", scene, frame)
-        path_m = add_timing_errors(path_m, light.first_ray + ray, order, detector, jitter)
+        path_m = add_timing_errors(
+            path_m, light.first_ray + ray, order, detector, physics.stream("jitter", scene, frame)
+        )
     add_photons(counts, bins.offset, bins.first_m, bins.width_m, bins.windows_m, ray, path_m)
 
 

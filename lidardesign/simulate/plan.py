@@ -253,8 +253,10 @@ class Planner:
             if reason is not None and isinstance(self.choice, frozenset):
                 raise ConfigError(f"{name} cannot be simulated here: {reason}", where="--effects", hint="leave it out")
         on = {name for name, reason in missing.items() if reason is None}
-        seconds = {name: predicted_seconds(name, self.detector, count) for name in EFFECTS}
-        decisions = (Decision(name, name in on, found[name], seconds[name], missing.get(name)) for name in EFFECTS)
+        decisions = (
+            Decision(name, name in on, found[name], predicted_seconds(name, self.detector, count), missing.get(name))
+            for name in EFFECTS
+        )
         return EffectPlan(tuple(decisions), self.tolerated)
 
     def physics(self, plan: EffectPlan, seed: int) -> Physics | None:
@@ -273,9 +275,12 @@ def parse_effects(text: str) -> Choice:
         return names[0]  # type: ignore[return-value]
     for name in names:
         if name not in EFFECTS:
-            allowed = f"one of {', '.join(WORDS)} alone, or any of {', '.join(EFFECTS)}"
-            hint = None if name in WORDS else suggest(name.lower(), [*EFFECTS, *WORDS])
-            raise ConfigError(f"unknown effect {name!r}", where="--effects", allowed=allowed, hint=hint)
+            raise ConfigError(
+                f"unknown effect {name!r}",
+                where="--effects",
+                allowed=f"one of {', '.join(WORDS)} alone, or any of {', '.join(EFFECTS)}",
+                hint=None if name in WORDS else suggest(name.lower(), [*EFFECTS, *WORDS]),
+            )
     return frozenset(names)
 
 
@@ -327,11 +332,12 @@ def _frame_bounds(counts: Counts, present: Sequence[str]) -> dict[str, EffectBou
     led = bounds["specular"].lost if "specular" in bounds else np.zeros(0)
     if not led.any():
         return bounds
-    unknown = "; unknown behind mirrors and glass"
     return {
         name: bound
         if name in OF_FIRST_HITS
-        else replace(bound, lost=np.maximum(bound.lost, led), reason=bound.reason + unknown)
+        else replace(
+            bound, lost=np.maximum(bound.lost, led), reason=f"{bound.reason}; unknown behind mirrors and glass"
+        )
         for name, bound in bounds.items()
     }
 
@@ -384,7 +390,7 @@ def add_quantisation_bounds(counts: Counts, bounds: dict[str, EffectBound]) -> d
         return bounds
     moving = {name: np.sqrt(bound.squared_m2) for name, bound in bounds.items() if name != "quantisation"}
     changed = dict(bounds)
-    chance = None if detector.photons is None else _Chance(counts)
+    chance = None if detector.photons is None else _bound_of_chance(counts)
     for name, shift_m in moving.items():
         squared_m2, lost = bounds[name].squared_m2, bounds[name].lost
         if detector.bin_m:
@@ -401,16 +407,14 @@ def add_quantisation_bounds(counts: Counts, bounds: dict[str, EffectBound]) -> d
     return changed
 
 
-class _Chance:
-    """Squared range error (N,) [m^2] and share of lost returns (N,) between two draws of photons."""
-
-    def __init__(self, counts: Counts) -> None:
-        detector, sigma_m, blind = counts.first_hits.detector, counts.first_hits.sigma_m(), Blindness.of(counts)
-        self.lost = counts.false_return_probability(blind, sigma_m)
-        if detector.estimator == "peak":
-            self.squared_m2 = 2 * counts.error_m(blind.left, sigma_m) ** 2
-        else:
-            self.squared_m2 = 2 * variance_of_missing(counts, counts.in_air, blind.left, sigma_m)
+def _bound_of_chance(counts: Counts) -> EffectBound:
+    """Bound of the difference between two draws of photons."""
+    sigma_m, blind = counts.first_hits.sigma_m(), Blindness.of(counts)
+    if counts.first_hits.detector.estimator == "peak":
+        variance_m2 = counts.error_m(blind.left, sigma_m) ** 2
+    else:
+        variance_m2 = variance_of_missing(counts, counts.in_air, blind.left, sigma_m)
+    return EffectBound(2 * variance_m2, counts.false_return_probability(blind, sigma_m), "other photons are drawn")
 
 
 def _steps_m2(counts: Counts, shift_m: np.ndarray, others_m: np.ndarray) -> np.ndarray:

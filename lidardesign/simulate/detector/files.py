@@ -102,12 +102,11 @@ def load_detector(name_or_path: str | Path) -> Detector:
     # an empty path is the current folder, and a name that is too long for a file is no file
     if not text.strip() or not os.path.exists(path):
         names = detector_names()
-        hint = suggest(text, names) or f"{page('detectors.md')} says how to write one"
         raise ConfigError(
             f"there is no detector {text!r}",
             where="--detector",
             allowed=f"{', '.join(names)}, or the path of a detector file",
-            hint=hint,
+            hint=suggest(text, names) or f"{page('detectors.md')} says how to write one",
         )
     document = load_yaml(path)
     if not document.mapping:
@@ -116,15 +115,15 @@ def load_detector(name_or_path: str | Path) -> Detector:
 
 
 def _detector(document: Document, fallback: str) -> Detector:
-    values = document.mapping
-    _check_keys(document, values)
-    chosen = {name: _choice(document, values, name, options) for name, options in CHOICES.items()}
-    found = {name: _number(document, values, name, quantity) for name, quantity in QUANTITIES.items()}
+    _check_keys(document)
+    chosen = {name: _choice(document, name, options) for name, options in CHOICES.items()}
+    found = {name: _number(document, name, quantity) for name, quantity in QUANTITIES.items()}
     photons = _photons(document, found, chosen["emission"])
-    name = values.get("name", fallback)
+    name = document.mapping.get("name", fallback)
     if not is_name(name):
-        allowed = "text without control characters"
-        raise ConfigError(f"name: found {name!r}", where=document.locate(("name",)), allowed=allowed)
+        raise ConfigError(
+            f"name: found {name!r}", where=document.locate(("name",)), allowed="text without control characters"
+        )
     detector = Detector(
         name=name,
         pulse_sigma_s=found["pulse_fwhm"] / FWHM_PER_SIGMA,
@@ -144,17 +143,18 @@ def _detector(document: Document, fallback: str) -> Detector:
     return detector
 
 
-def _check_keys(document: Document, values: Mapping[str, Any]) -> None:
+def _check_keys(document: Document) -> None:
     spelled = {key: name for name, quantity in QUANTITIES.items() for key in quantity.keys(name)}
     seen: dict[str, str] = {}
-    for key in values:
+    for key in document.mapping:
         where = document.locate((key,), key=True)
         name = key if key == "name" or key in CHOICES else spelled.get(key)
         if name is None:
             meant = key if key in QUANTITIES else key.rpartition("_")[0]
             allowed = QUANTITIES[meant].keys(meant) if meant in QUANTITIES else [*spelled, "name", *CHOICES]
-            hint = suggest(key, allowed)
-            raise ConfigError(f"unknown key {key!r}", where=where, allowed=", ".join(allowed), hint=hint)
+            raise ConfigError(
+                f"unknown key {key!r}", where=where, allowed=", ".join(allowed), hint=suggest(key, allowed)
+            )
         if name in seen:
             raise ConfigError(
                 f"{key!r} and {seen[name]!r} are the same quantity", where=where, allowed="only one of them"
@@ -162,11 +162,11 @@ def _check_keys(document: Document, values: Mapping[str, Any]) -> None:
         seen[name] = key
 
 
-def _number(document: Document, values: Mapping[str, Any], name: str, quantity: Quantity) -> float | None:
+def _number(document: Document, name: str, quantity: Quantity) -> float | None:
     """A quantity in SI units, or its default."""
     for key, scale in zip(quantity.keys(name), quantity.units.values(), strict=True):
-        if key in values:
-            return _checked(values[key], document.locate((key,)), key, quantity, scale)
+        if key in document.mapping:
+            return _checked(document.mapping[key], document.locate((key,)), key, quantity, scale)
     return quantity.default
 
 
@@ -183,12 +183,11 @@ def _checked(value: Any, where: str, key: str, quantity: Quantity, scale: float)
     return number
 
 
-def _choice(document: Document, values: Mapping[str, Any], name: str, options: tuple[str, ...]) -> Any:
-    if name not in values:
-        return None
-    if values[name] not in options:
-        raise ConfigError(f"{name}: found {values[name]!r}", where=document.locate((name,)), allowed=", ".join(options))
-    return values[name]
+def _choice(document: Document, name: str, options: tuple[str, ...]) -> Any:
+    found = document.mapping.get(name)
+    if name in document.mapping and found not in options:
+        raise ConfigError(f"{name}: found {found!r}", where=document.locate((name,)), allowed=", ".join(options))
+    return found
 
 
 def _photons(document: Document, found: Mapping[str, float | None], emission: Any) -> Photons | None:
@@ -232,11 +231,10 @@ def _check_together(document: Document, detector: Detector) -> None:
     if photons is None:
         return
     if detector.bins is not None and detector.bins * detector.bin_s * photons.repetition_hz > 1:
-        longest = math.floor(1 / (photons.repetition_hz * detector.bin_s))
         raise ConfigError(
             f"bins: {detector.bins} bins last longer than the {1e9 / photons.repetition_hz:g} ns between pulses",
             where=document.locate(("bins",)),
-            allowed=f"at most {longest}",
+            allowed=f"at most {math.floor(1 / (photons.repetition_hz * detector.bin_s))}",
         )
     if photons.filter_m >= photons.wavelength_m:
         key = next(key for key in LIGHT["filter_width"].keys("filter_width") if key in document.mapping)

@@ -89,7 +89,7 @@ def direct_echoes(scene: Scene, beams: Beams, hits: Hits) -> Echoes:
     back = home - points
     # a beam that starts at the receiver returns along the same path, to the last bit
     back_m = np.where((origins == home).all(axis=1), hits.range_m[seen], np.linalg.norm(back, axis=1))
-    reflectance = np.array([body.reflectance for body in scene.bodies])[hits.body[seen]]
+    reflectance = reflectances(scene, hits)[seen]
     with np.errstate(divide="ignore", invalid="ignore"):
         cosine = np.maximum(np.einsum("nk,nk->n", hits.normal[seen], back) / back_m, 0.0)
         gain = beams.share[seen] * reflectance * cosine / (np.pi * back_m**2)

@@ -268,9 +268,9 @@ def check_windows(windows_m: np.ndarray, detector: Detector) -> None:
             )
         if detector.histogram_start == "pulse" and wide[:, 1].max() > reach * (1 + SLACK):
             low, high = wide[np.argmax(wide[:, 1])]
-            inside = "starts outside" if low >= reach else "ends outside"
             raise ConfigError(
-                f"a gate from {low:.4g} to {high:.4g} m {inside} the histogram, which starts with the pulse",
+                f"a gate from {low:.4g} to {high:.4g} m {'starts' if low >= reach else 'ends'} outside the histogram, "
+                "which starts with the pulse",
                 where=where,
                 allowed=what,
                 hint=_NARROWER,
@@ -351,8 +351,7 @@ class Physics:
 
     def stream(self, effect: str, scene: Scene, frame: int) -> int:
         """Key of an effect's random numbers in a frame of a scene, independent of other effects."""
-        again = (str(self.repeat),) if self.repeat else ()
-        label = "\0".join((str(self.seed), effect, scene.name, str(frame), *again))
+        label = "\0".join(map(str, (self.seed, effect, scene.name, frame, *([self.repeat] if self.repeat else []))))
         return int.from_bytes(hashlib.sha256(label.encode()).digest()[:8], "little")
 
 

@@ -235,7 +235,10 @@ class Counts:
         """Share of an echo's photons in an odd number of bins, at most the share inside its gate, shape (N,)."""
         away = (self.first_hits.window_m - self.first_hits.path_m[:, None]).T / np.maximum(sigma_m, SQUARABLE)
         inside = np.where(self.first_hits.returned, scipy.special.ndtr(away[1]) - scipy.special.ndtr(away[0]), 1.0)
-        return np.minimum(share_in_bins(count, self.bin_m, sigma_m), inside)
+        # in the worst case the echo lies on an edge of the middle bin
+        spread_m = math.sqrt(2) * np.maximum(sigma_m, SQUARABLE)
+        ends = (scipy.special.erf((count + step) / 2 * self.bin_m / spread_m) for step in (-1, 1))
+        return np.minimum(0.5 * sum(ends), inside)
 
     def missed(self, signal: np.ndarray, per_bin: np.ndarray | float, sigma_m: np.ndarray) -> np.ndarray:
         """Probability that the echo's bins hold fewer counts than the detection threshold, shape (N,).
@@ -315,14 +318,6 @@ class Counts:
 def count_text(number: float) -> str:
     """An expected count as text."""
     return f"{number:,.0f}" if number >= MANY else f"{number:.2g}"
-
-
-def share_in_bins(count: int, bin_m: float, sigma_m: np.ndarray) -> np.ndarray:
-    """Share of an echo's photons in an odd number of bins in the worst case, on an edge of the middle one, (N,)."""
-    spread_m = math.sqrt(2) * np.maximum(sigma_m, SQUARABLE)
-    return 0.5 * (
-        scipy.special.erf((count - 1) / 2 * bin_m / spread_m) + scipy.special.erf((count + 1) / 2 * bin_m / spread_m)
-    )
 
 
 def needed_counts(per_bin: np.ndarray, bins: np.ndarray, false_alarm: float) -> np.ndarray:

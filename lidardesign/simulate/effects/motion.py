@@ -136,8 +136,7 @@ class _MovingBody:
         passed = np.clip(np.floor(time_s * self._rate_hz), 0, left).astype(np.int64)
         for frames in np.unique(passed).tolist():
             rows = np.flatnonzero(passed == frames)
-            path = path_of(self._body, self._frame + frames, self._rate_hz)
-            yield path, rows, time_s[rows] - frames / self._rate_hz
+            yield path_of(self._body, self._frame + frames, self._rate_hz), rows, time_s[rows] - frames / self._rate_hz
 
     def _near(
         self, path: Screw, origins: np.ndarray, directions: np.ndarray, time_s: np.ndarray, limit_m: np.ndarray
@@ -153,8 +152,9 @@ class _MovingBody:
         squared = np.einsum("nk,nk->n", offset, offset)
         slack = BALL_SLACK * squared
         reach = radius_m + np.sqrt(slack)
-        passes = (squared - along**2 <= radius_m**2 + slack) & (along >= -reach) & (along - reach <= limit_m)
-        return np.flatnonzero(passes)
+        return np.flatnonzero(
+            (squared - along**2 <= radius_m**2 + slack) & (along >= -reach) & (along - reach <= limit_m)
+        )
 
 
 def _local_tracer(shape: Shape) -> tuple[LocalTracer, np.ndarray, float]:

@@ -147,8 +147,9 @@ class _View:
         earliest_m = np.maximum(windows_m[number, 0], direct.path_m - apart_m)
         reach_m = float((windows_m[number, 1] - earliest_m).max(initial=0.0))
         # Bins of whole paths that cover twice a reach of half paths, and half a bin on either side of it
-        told_apart_m = 2 * resolution_m(physics.detector) / CELLS_PER_RESOLUTION
-        finest_m = max(told_apart_m, 2 * reach_m / MOST_CELLS, EPSILON_FLOAT32)
+        finest_m = max(
+            2 * resolution_m(physics.detector) / CELLS_PER_RESOLUTION, 2 * reach_m / MOST_CELLS, EPSILON_FLOAT32
+        )
         width_m = 10 ** (math.ceil(math.log10(finest_m) * WIDTHS_PER_DECADE) / WIDTHS_PER_DECADE)
         count = math.ceil(2 * reach_m / width_m) + 1
         bins = PathBins(width_m, 1 << (count - 1).bit_length())

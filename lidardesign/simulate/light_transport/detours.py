@@ -31,6 +31,7 @@ from lidardesign.numerics import COARSE_SLACK, safe_divide
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import Hits, Rays, in_view
 from lidardesign.scenes.scene import Scene
+from lidardesign.simulate.detector.light import reflectances
 
 # Points whose view is measured, directions from each, and directions from their hits: up to forty thousand rays.
 MOST_POINTS, DIRECTIONS, FURTHER_DIRECTIONS = 64, 64, 4
@@ -117,7 +118,7 @@ def pixel_bound(
     chosen = _sample(hits)
     distance_m, normal = hits.range_m[chosen], hits.normal[chosen]
     place = rays.origin_m[chosen] + distance_m[:, None] * rays.direction[chosen]
-    own = np.array([body.reflectance for body in scene.bodies])[hits.body[chosen]]
+    own = reflectances(scene, hits)[chosen]
     start = _Ends(np.arange(len(chosen)), own, place, normal, np.zeros(len(chosen)))
     cosine = np.abs(np.einsum("kj,kj->k", normal, rays.direction[chosen]))
     spot_m2 = pixel_sr * distance_m**2 / np.maximum(cosine, FLATTEST_COSINE)
@@ -207,10 +208,9 @@ def _next(scene: Scene, caster: SceneCaster, ends: _Ends, directions: int) -> _E
     found = caster.first_hit(start, direction)
     met = np.flatnonzero(found.body >= 0)
     source, reached = source[met], found.range_m[met]
-    reflectance = np.array([body.reflectance for body in scene.bodies])[found.body[met]]
     return _Ends(
         ends.point[source],
-        ends.weight[source] * reflectance / directions,
+        ends.weight[source] * reflectances(scene, found)[met] / directions,
         start[met] + reached[:, None] * direction[met],
         found.normal[met],
         ends.path_m[source] + reached,

@@ -165,8 +165,12 @@ class Lights:
         """A fixed receiver as a light, by reciprocity: 1 W/sr within its field of view."""
         axes = receiver_axes(receiver)
         made = cls.everywhere(np.asarray(receiver.origin_m)[None], axes[:1], 1.0)
-        tangents = np.tan([[receiver.horizontal_rad / 2, receiver.vertical_rad / 2]])
-        return replace(made, axes=axes[None], least_cosine=np.zeros(1), tangents=tangents)
+        return replace(
+            made,
+            axes=axes[None],
+            least_cosine=np.zeros(1),
+            tangents=np.tan([[receiver.horizontal_rad / 2, receiver.vertical_rad / 2]]),
+        )
 
     @classmethod
     def everywhere(cls, origin_m: np.ndarray, forward: np.ndarray, intensity: float) -> Lights:
@@ -298,8 +302,7 @@ def render_transient(
     parts = []
     for number, rows in enumerate(_chunks(count, bins.count)):
         mine = arrays | {name: values[rows] for name, values in by_ray.items()}
-        own_seed = int(np.random.SeedSequence([seed, number]).generate_state(1)[0])
-        found = ask({**request, "seed": own_seed}, mine)
+        found = ask({**request, "seed": int(np.random.SeedSequence([seed, number]).generate_state(1)[0])}, mine)
         parts.append({**found, "ray": found["ray"] + rows[0]})
     ray, cell, radiance, steady = (
         np.concatenate([part[name] for part in parts]) for name in ("ray", "cell", "radiance", "steady")

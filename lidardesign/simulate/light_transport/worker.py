@@ -166,8 +166,10 @@ def _lights(mi: Any, dr: Any) -> type:
 def _shapes(mi: Any, request: dict[str, Any], arrays: dict[str, np.ndarray]) -> dict[str, Any]:
     made: dict[str, Any] = {}
     for number, shape in enumerate(request["shapes"]):
-        matt = {"type": "diffuse", "reflectance": {"type": "uniform", "value": shape["reflectance"]}}
-        material = {"type": "twosided", "inner": matt}
+        material = {
+            "type": "twosided",
+            "inner": {"type": "diffuse", "reflectance": {"type": "uniform", "value": shape["reflectance"]}},
+        }
         name = f"body{number}"
         if shape["kind"] == "mesh":
             made[name] = _mesh(mi, name, material, arrays[f"vertices{number}"], arrays[f"faces{number}"])
@@ -193,14 +195,6 @@ def _mesh(mi: Any, name: str, surface: dict[str, Any], vertices: np.ndarray, fac
 
 def _render(mi: Any, dr: Any, request: dict[str, Any], arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     samples, rays = int(request["samples"]), len(arrays["origin"])
-    film = {
-        "type": "transient_hdr_film",
-        "width": rays,
-        "height": 1,
-        "rfilter": {"type": "box"},
-        "temporal_bins": int(request["bins"]),
-        "bin_width_opl": float(request["width_m"]),
-    }
     scene = mi.load_dict(
         {
             "type": "scene",
@@ -208,7 +202,14 @@ def _render(mi: Any, dr: Any, request: dict[str, Any], arrays: dict[str, np.ndar
             "lights": {"type": "lidardesign_lights"},
             "sensor": {
                 "type": "lidardesign_rays",
-                "film": film,
+                "film": {
+                    "type": "transient_hdr_film",
+                    "width": rays,
+                    "height": 1,
+                    "rfilter": {"type": "box"},
+                    "temporal_bins": int(request["bins"]),
+                    "bin_width_opl": float(request["width_m"]),
+                },
                 "sampler": {"type": "independent", "sample_count": samples},
             },
         }
