@@ -176,8 +176,9 @@ class Child:
             # what the work starts is ended with it, and a terminal's Ctrl-C is for this process
             start_new_session=True,
         )
-        for read in (self._read_answers, self._read_printed):
-            threading.Thread(target=read, daemon=True).start()
+        self._printing = threading.Thread(target=self._read_printed, daemon=True)
+        for reader in (threading.Thread(target=self._read_answers, daemon=True), self._printing):
+            reader.start()
         self.send([sys.path, function, request])
 
     @property
@@ -253,6 +254,8 @@ class Child:
         self._process.kill()
         self._process.wait()
         self._process.stdin.close()  # type: ignore[union-attr]
+        # what it printed last is on its way; a process that left its group may hold the pipe for ever
+        self._printing.join(GRACE_SECONDS)
 
     def _read_answers(self) -> None:
         with io.BufferedReader(self._process.stdout) as pipe:  # type: ignore[arg-type]
