@@ -1,5 +1,5 @@
 # make demo   sets everything up in .venv and runs the whole chain on the built-in face task, three to four minutes
-# make test   sets up, lints and runs the tests, a few minutes; installs nothing outside of .venv, 3.3 GB there with torch for the processor
+# make test   sets up, lints and runs the tests, ten minutes; installs nothing outside of .venv, 3.3 GB there with torch for the processor
 # make test-slow  runs what takes longer: pages of the docs and examples from beginning to end, packages, kills; as CI does
 # make docs   writes the documentation with a search as pages of build/site, which load nothing from elsewhere
 # make consumers  installs the programs that tests give exported files to, from the system's packages, as CI does

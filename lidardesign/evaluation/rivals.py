@@ -99,8 +99,8 @@ def _add(
     problem = replace(problem, config=request.settings.get(method.name))
     refusal = refusal_of(method, problem)
     if refusal is not None:
-        stands = matched and any((one.name, one.rays) == (method.name, matched.rays) for one in found.entries)
-        at = " at equal bandwidth" if stands else ""
+        has_row = matched and any((one.name, one.rays) == (method.name, matched.rays) for one in found.entries)
+        at = " at equal bandwidth" if has_row else ""
         found.note(f"{method.name} is left out{at}: {refusal}" if refusal else "")
         return
     rays_of: Callable[[DesignSpec], Positions] = partial(fired, conditions=request.conditions, planner=request.planner)

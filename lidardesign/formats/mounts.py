@@ -18,7 +18,7 @@ import numpy as np
 
 from lidardesign.errors import DataError
 from lidardesign.formats.names import distinct, identifier
-from lidardesign.formats.rig import members
+from lidardesign.formats.rig import indices_by_owner
 from lidardesign.numerics import COARSE_SLACK, SLACK
 from lidardesign.scenes.rays import DEFAULT_RATE_HZ, Rays
 from lidardesign.sensors.compare import angles_between
@@ -71,7 +71,7 @@ def mounts(design: DesignSpec, rays: Rays) -> list[Mount]:
     names = distinct([identifier(sensor.name) for sensor in design.sensors], "_")
     return [
         _mount(name, sensor, rays, own)
-        for name, sensor, own in zip(names, design.sensors, members(rays.sensor, len(names)), strict=True)
+        for name, sensor, own in zip(names, design.sensors, indices_by_owner(rays.sensor, len(names)), strict=True)
         if len(own)
     ]
 
@@ -167,7 +167,7 @@ def places(mounted: Sequence[Mount], rays: Rays) -> list[Place]:
     found = []
     for mount in mounted:
         origins, first, place = np.unique(rays.origin_m[mount.ray], axis=0, return_index=True, return_inverse=True)
-        own = members(place.reshape(-1), len(origins))
+        own = indices_by_owner(place.reshape(-1), len(origins))
         for number, here in enumerate(np.argsort(first)):
             name = mount.name if len(origins) == 1 else f"{mount.name}_place_{number}"
             found.append(Place(name, mount, origins[here], mount.ray[own[here]]))

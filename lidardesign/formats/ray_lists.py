@@ -22,7 +22,7 @@ import numpy as np
 
 from lidardesign.errors import DataError
 from lidardesign.formats import ADAPTIVE, RAYS, Format
-from lidardesign.formats.rig import MOST_SENSORS, Rig, RigSensor, members, number_of
+from lidardesign.formats.rig import MOST_SENSORS, Rig, RigSensor, indices_by_owner, number_of
 from lidardesign.limits import MOST_RAYS
 from lidardesign.numerics import COARSE_SLACK, SLACK
 from lidardesign.run.arrays import NUMERIC_KINDS, csv_rows, csv_table, read_npz
@@ -122,7 +122,7 @@ def rig_of_columns(columns: RayColumns, kind: str) -> Rig:
     gate = np.stack([start, end], axis=1)
     sensors = [
         RigSensor(name, origin[rays], azimuth[rays], elevation[rays], gate[rays], order=rays)
-        for name, rays in zip(columns.names, members(columns.sensor, len(columns.names)), strict=True)
+        for name, rays in zip(columns.names, indices_by_owner(columns.sensor, len(columns.names)), strict=True)
     ]
     return Rig(kind, sensors, notes, f"add a column {END}")
 

@@ -105,7 +105,7 @@ class Rig:
     end_hint: str = "give their ends in the file"
 
 
-def members(owners: np.ndarray, count: int) -> list[np.ndarray]:
+def indices_by_owner(owners: np.ndarray, count: int) -> list[np.ndarray]:
     """Indices of the entries (N,) of each of so many owners, in their order."""
     return np.split(np.argsort(owners, kind="stable"), np.cumsum(np.bincount(owners, minlength=count))[:-1])
 
